@@ -11,7 +11,6 @@ import uuid
 from dataclasses import dataclass
 from typing import Any
 
-from lab.benchmarks.paper_template import EXPERIENCES, Newest, PaperTemplate
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
 from service.deciding.deliberation import candidates_of, template_of
@@ -21,7 +20,7 @@ from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
-from shared.wire.schemas import MissionSpec, Outcome, PromptStyle
+from shared.wire.schemas import MissionSpec, Outcome
 from shared.world.actions import Action
 from shared.world.scenario import Scenario
 from simulator.flying.flight import fly
@@ -30,16 +29,14 @@ from simulator.sites.site import Site
 from simulator.world.observation import Observation
 from simulator.world.observation_report import decide_request
 
-GUIDED, LLM, LLM_ALL, LLM_30, PAPER = "guided", "llm", "llm_no_attention", "llm_30", "paper"
+GUIDED, LLM, PAPER = "guided", "llm", "paper"
 WAYS = {
     GUIDED: "mode guided (default)",
-    LLM: "mode llm (default)",
-    LLM_ALL: "mode llm, attention off",
-    LLM_30: "mode llm, 30 experiences",
-    PAPER: "the paper's template",
+    LLM: "mode llm: the paper's template",
+    PAPER: "the same without attention",
 }
 _POLICY = "mpc"
-# Enough for the longest prompt, the paper's.
+# Enough for the longest prompt, the paper's without attention.
 CONTEXT = 8192
 
 
@@ -152,26 +149,15 @@ class Scribe(LocalPilot):
 def missions(scenario: Scenario, seed: int) -> dict[str, Mission]:
     """The edge's mission for each of ``WAYS``, with the default settings."""
     settings = Settings(llm_context=CONTEXT, llm_adapter="off")
-    many = PromptStyle(experiences=EXPERIENCES)
 
     def made(name: str, **spec: Any) -> Mission:
         return Mission(name, MissionSpec(scenario=scenario, seed=seed, planner="off", **spec), settings)
 
-    found = {
+    return {
         GUIDED: made(GUIDED, mode="guided"),
         LLM: made(LLM, mode="llm"),
-        LLM_ALL: made(LLM_ALL, mode="llm", attention="off"),
-        LLM_30: made(LLM_30, mode="llm", prompt=many),
-        PAPER: made(PAPER, mode="llm", attention="off", prompt=many),
+        PAPER: made(PAPER, mode="llm", attention="off"),
     }
-    as_the_paper(found[PAPER])
-    return found
-
-
-def as_the_paper(mission: Mission) -> None:
-    """Give a mission the paper's prompt."""
-    mission.template = PaperTemplate(mission.scenario)
-    mission.experiences = Newest(EXPERIENCES, uavs=mission.scenario.uavs)
 
 
 def flown(scenario: Scenario, seed: int, policy: str = _POLICY) -> Scribe:

@@ -1,14 +1,14 @@
-"""Tokens of a decision beside the paper's own template, and their cost in time and quality.
+"""Tokens of a decision in the paper's template with and without attention, and their cost in time and quality.
 
     python -m benchmarks.tokens
     python -m benchmarks.tokens --seeds 30 --asked 3    # more decisions for the LLM: narrower intervals
 
 It flies missions by a planner and makes the prompts of every decision in several forms: those of the edge's modes, and
-the paper's, with all sensors in words and 30 experiences (`lab/benchmarks/paper_template.py` says which parts of it are
-known). It counts whole prompts in tiktoken's o200k_base and in the embedded model's own tokens, and the newly read
-tokens of a server that has the prompt before in its cache. The embedded model answers some decisions from the middle of
-each mission: the benchmark measures time, the server's own account of its cache, and the answers' quality by the edge's
-rollout evaluator. Intervals are 95% bootstrap intervals over missions (tokens), decisions (quality) or pairs (times).
+the paper's with every sensor that a UAV has heard, free and charged. It counts whole prompts in tiktoken's o200k_base
+and in the embedded model's own tokens, and the newly read tokens of a server that has the prompt before in its cache.
+The embedded model answers some decisions from the middle of each mission: the benchmark measures time, the server's own
+account of its cache, and the answers' quality by the edge's rollout evaluator. Intervals are 95% bootstrap intervals
+over missions (tokens), decisions (quality) or pairs (times).
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from rich.progress import track
 from benchmarks.flown_prompts import CONTEXT, GUIDED, LLM, PAPER, WAYS, Asked, flown
 from benchmarks.harness import Cell, Goal, Options, Report, run
 from lab.benchmarks.local_llm import Answered, LocalLLM
-from lab.benchmarks.paper_template import STATED_STATE_TOKENS
 from lab.experiments.intervals import interval, paired, ratio_of_medians
 from service.config.settings import Settings
 from service.deciding.rollout_evaluator import evaluate
@@ -78,14 +77,14 @@ def measure(args: Tokens) -> Report:
         "model": name,
         "decisions": [len(flight) for flight in flights],
         "tokens": tokens,
-        "state_tokens_stated_by_the_paper": STATED_STATE_TOKENS,
+        "state_tokens_by_step": by_step(flights),
         "asked": asked_figures(put(flights, scenario, args), scenario),
     }
-    goals = []
-    for way in (GUIDED, LLM):
-        ratio = tokens[way]["ratio"]
-        goals.append(Goal(f"{WAYS[way]}: tokens to the paper's", ratio["own"], most=GOAL_PROMPT))
-        goals.append(Goal(f"{WAYS[way]}: newly read to the paper's whole", ratio["new_to_whole"], most=GOAL_NEW))
+    ratio = tokens[GUIDED]["ratio"]
+    goals = [
+        Goal(f"{WAYS[GUIDED]}: tokens to the paper's", ratio["own"], most=GOAL_PROMPT),
+        Goal(f"{WAYS[GUIDED]}: newly read to the paper's whole", ratio["new_to_whole"], most=GOAL_NEW),
+    ]
     return Report(found, tables(found), goals)
 
 
@@ -104,6 +103,20 @@ def counted(flights: Sequence[Sequence[Asked]], llm: LocalLLM) -> dict[str, dict
             means[way]["own"].append(statistics.fmean(map(len, own)))
             means[way]["new"].append(statistics.fmean(new))
     return means
+
+
+def by_step(flights: Sequence[Sequence[Asked]]) -> dict[str, dict[int, list[float]]]:
+    """Tokens of the state block by o200k_base: mean and standard deviation by step, and ``all`` without any mask."""
+    counter = TokenCounter(Settings().cache_dir)
+    found: dict[str, dict[int, list[float]]] = {LLM: {}, PAPER: {}, "all": {}}
+    every = [asked for flight in flights for asked in flight]
+    for step in sorted({asked.step for asked in every}):
+        prompts = {way: [asked.ways[way].prompt for asked in every if asked.step == step] for way in (LLM, PAPER)}
+        counts = {way: [counter.count(prompt.state) for prompt in of_way] for way, of_way in prompts.items()}
+        counts["all"] = [prompt.uncompressed.tokens(counter.count) for prompt in prompts[PAPER]]
+        for way, own in counts.items():
+            found[way][step] = [statistics.fmean(own), statistics.pstdev(own)]
+    return found
 
 
 def anew(now: Sequence[int], before: Sequence[int]) -> int:

@@ -30,11 +30,11 @@ from rich.progress import track
 from torch import nn
 
 from lab.benchmarks.local_llm import LocalLLM
-from lab.benchmarks.paper_template import PaperTemplate
 from lab.experiments.intervals import ratio_of_medians
 from service.learning.initial_weights import initial_weights
 from service.learning.modules import top_k
 from service.llm.request_bodies import chat_body
+from service.prompting.paper_prompt import Template
 from shared.features.augmented_state import FEATURES
 from shared.world.scenario import Scenario, scenario_named
 
@@ -120,7 +120,7 @@ def side_by_side(scenario: Scenario, args: Compressors, console: Console) -> tup
     window: dict[str, list[float]] = {label: [] for label in encoders}
     read_s: list[float] = []
     # About one window: the static block, and little more.
-    static, sensors = PaperTemplate(scenario).static, list(range(scenario.sensors))
+    static, sensors = Template(scenario).static, list(range(scenario.sensors))
     body = chat_body(None, static, "Current state: none", "grammar", sensors, scenario.max_velocity + 1)
     with LocalLLM(args.threads, _CONTEXT) as llm:
         for _ in track(range(args.repeats), "Compressing", console=console):

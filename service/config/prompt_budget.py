@@ -4,8 +4,8 @@ from shared.wire.schemas import Features, PromptFormat
 
 # Upper bounds in tokens of the embedded model, which has one for each digit: of the static block, and of a row or an
 # experience in each format.
-_STATIC_TOKENS = 400
-_ROW_TOKENS = {"csv": 32, "compact": 12}
+_STATIC_TOKENS = 800
+_ROW_TOKENS = {"csv": 44, "compact": 12}
 # Of the two further columns of feature preset `reach`.
 _REACH_TOKENS = 16
 

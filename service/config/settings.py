@@ -134,9 +134,9 @@ class Settings(BaseSettings):
     deadline_ms: int = Field(3000, ge=10, le=60_000)
     # Sensors that the attention module selects for the prompt (k in the paper).
     top_k: int = Field(5, ge=1, le=100)
-    # Experiences in the prompt before half of them are dropped. An appended experience leaves the LLM's prefix cache
-    # valid. Dropping costs a prefill of the others, so it happens rarely.
-    experiences: int = Field(8, ge=0, le=200)
+    # Experiences in the prompt before half of them are dropped; unset: 30 in the paper's prompt (mode `llm`), else 8.
+    # An appended experience leaves the LLM's prefix cache valid. Dropping costs a prefill of the others, so it is rare.
+    experiences: int | None = Field(None, ge=0, le=200)
     # The experiences in the prompt: `recent` ones, those `similar` to the present state, the `best` and a few of the
     # worst, or the newest of each sensor, `failures` first.
     selection: Selection = "recent"
@@ -213,13 +213,18 @@ class Settings(BaseSettings):
 
     @model_validator(mode="after")
     def _prompt_fits(self) -> Self:
-        needed = prompt_tokens("csv", self.top_k, self.experiences)
+        experiences = self.most_experiences(self.mode)
+        needed = prompt_tokens("csv", self.top_k, experiences)
         if needed > self.llm_context:
             raise ValueError(
-                f"{self.experiences} experiences and {self.top_k} sensors need up to {needed} tokens: "
+                f"{experiences} experiences and {self.top_k} sensors need up to {needed} tokens: "
                 f"raise AICVDS_LLM_CONTEXT (now {self.llm_context}) or lower AICVDS_EXPERIENCES"
             )
         return self
+
+    def most_experiences(self, mode: Mode) -> int:
+        """The most experiences in a prompt of this mode, unless the mission has its own number."""
+        return (30 if mode == "llm" else 8) if self.experiences is None else self.experiences
 
     def each_server(self) -> list[Settings]:
         """Settings with a single LLM server, for each server in the order of their URLs; raises ``ValueError``."""

@@ -39,7 +39,7 @@ class ResolvedSpec(MissionSpec):
         as_published = mode == "llm" and not compact
         experiences = spec.prompt.experiences
         if experiences is None:
-            experiences = 0 if compact else settings.experiences
+            experiences = 0 if compact else settings.most_experiences(mode)
         prompt = {
             "format": row_format,
             "experiences": experiences,

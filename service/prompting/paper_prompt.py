@@ -1,4 +1,7 @@
-"""The paper's long prompt, of mode ``llm``: a table of the sensors, answered by a sensor and a velocity."""
+"""The paper's prompt, of mode ``llm``, in our own words; docs/results/paper.md sets its elements beside the paper's.
+
+What never changes comes first, for the LLM server's prefix cache: so the cost function stands before the experiences.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,6 @@ from service.prompting.rows import (
     columns,
     experience,
     introduction,
-    meanings,
     row,
 )
 from service.prompting.unpruned_state import UnprunedState
@@ -23,22 +25,40 @@ from shared.wire.schemas import Features
 from shared.world.actions import Action
 from shared.world.scenario import Scenario
 
-_STATIC = """You direct a fleet of UAVs that collect data packets from ground sensors along a pipeline. \
-At each waypoint you choose one sensor to collect from and the velocity for the next {step_s:g} seconds.
+_STATIC = """You schedule data collection for a fleet of UAVs that fly over ground sensors along a pipeline.
 
-Goal: lose no packets. A sensor's queue holds {capacity} packets; what arrives beyond that is lost. \
-A transmission fails beyond {radius:g} m, or at a channel gain of {limit:g} dB or below.
+Goal: lose as few packets as possible over all sensors. At each waypoint make two decisions: the one ground sensor to \
+collect from (ID 0 to {last}), and the velocity for the next {step_s:g} seconds (0 to {max_velocity} m/s).
 
+Procedure:
+1. Look at every sensor of the current task: its queue, residual energy, location, channel quality (path loss), time \
+since its last visit, urgency and overflow probability.
+2. Rank the sensors. What speaks for one is a long queue, a high urgency or overflow probability, a long time without \
+a visit, little residual energy and a good channel (low path loss).
+3. Compare with past decisions and what they led to.
+4. Choose exactly one sensor and one velocity.
+
+Scheduling rules:
+- Long queues come first, so that they do not overflow.
+- A better channel (a higher gain, less path loss) makes a transmission more likely to succeed. It fails beyond \
+{radius:g} m, or at a gain of {limit:g} dB or below.
+- Collect from a sensor with a low battery before its energy is used up.
+- A high UrgencyScore comes first, above all with a high OverflowProb: such a sensor is the next to drop packets.
+- A large TimeSinceLastVisit comes first, so that every sensor gets its share and none is neglected.
+
+Velocity strategy, in whole m/s:
+- By the chosen sensor's distance: {far} beyond 50 m, {near} within 50 m, 0 while hovering at it.
+- A higher velocity can shorten the travel time.
+
+Cost:
+- Packet loss: a poor channel (high path loss) loses packets, so a sensor with a better channel costs less.
+- Queue overflow: a queue holds {capacity} packets; what arrives beyond that is dropped, which raises the cost.
+
+The current task is the UAV's waypoint and a row for each of the {kept}, {order}:
 {introduction}
-{meanings}
 
-Rules:
-1. Prefer a full queue, then a long age.
-2. The sensor must be in reach after the UAV has moved.
-3. Velocity, in whole m/s, follows the chosen sensor's distance: {far} beyond 50 m, {near} within 50 m, \
-0 at the sensor.
-
-{note}{experiences}{demonstrations}Answer with two whole numbers and nothing else: sensor_id velocity"""
+{note}{experiences}{demonstrations}Output: exactly two whole numbers with a space between them, sensor_id velocity, \
+and nothing else: no explanation, no reasoning."""
 
 # The paper's highest velocity within 50 m of the chosen sensor, m/s.
 _NEAR_VELOCITY = 7
@@ -62,7 +82,7 @@ class Template:
         scenario: Scenario,
         features: Features = "paper",
         *,
-        experiences: int = 8,
+        experiences: int = 30,
         ranked: bool = True,
         demonstrations: Sequence[Solved] = (),
         note: str | None = None,
@@ -72,14 +92,17 @@ class Template:
         examples = f"{_EXAMPLES}\n\n{self.demonstrations}" if demonstrations else ""
         order = "the most promising first" if ranked else "in no particular order"
         self.static = _STATIC.format(
+            last=scenario.sensors - 1,
+            max_velocity=scenario.max_velocity,
             step_s=scenario.step_s,
             capacity=scenario.queue_capacity,
             radius=scenario.radio_radius_m,
             limit=-scenario.path_loss_limit_db,
             far=_levels(_NEAR_VELOCITY + 1, scenario.max_velocity),
             near=_levels(1, min(_NEAR_VELOCITY, scenario.max_velocity)),
-            introduction=introduction(self._columns, order),
-            meanings=meanings(features),
+            kept="sensors that attention selected" if ranked else "sensors",
+            order=order,
+            introduction=introduction(features),
             note=note_block(note),
             experiences=f"{EXPERIENCE_NOTE}\n\n" if experiences else "",
             demonstrations=examples,
@@ -103,7 +126,8 @@ class Template:
             experiences: the lines of the block of experiences.
             nearest: lines of experiences for this prompt only.
         """
-        last = "".join(nearest)
+        east, north = state.position
+        last = f"{''.join(nearest)}UAV at {east:.0f},{north:.0f}\n"
         return Prompt(
             static=self.static,
             experiences="".join(experiences),

@@ -16,78 +16,77 @@ Cells = Mapping[str, str]
 
 UNKNOWN = "?"
 # Columns that are known without a beacon.
-ALWAYS_KNOWN = ("sensor_id", "age", "distance")
+ALWAYS_KNOWN = ("sensor_id", "distance", "age")
 
-_MEANINGS = {
-    "queue": "packets waiting",
-    "gain": "channel gain in dB",
-    "age": "steps since its last visit",
-    "distance": "metres from this UAV",
+# The columns of the paper's table of sensors, and those that preset `reach` adds: the heading and the meaning of each.
+_PAPER_COLUMNS = {
+    "sensor_id": ("SensorID", "the sensor"),
+    "queue": ("Queue", "packets waiting"),
+    "battery": ("BatteryLevel", "residual energy in J"),
+    "gain": ("ChannelGain", "minus the path loss, in dB"),
+    "distance": ("Distance", "metres from the UAV"),
+    "age": ("TimeSinceLastVisit", "steps"),
+    "urgency": ("UrgencyScore", "percent"),
+    "overflow": ("OverflowProb", "probability of an overflow before the next visit, percent"),
 }
-_REACH_MEANINGS = {"best": "the best velocity for it", "movable": "packets that can be collected at that velocity"}
-_NUMERALS = {5: "five", 7: "seven"}
+_REACH_COLUMNS = {
+    "best": ("BestVelocity", "the best velocity for it"),
+    "movable": ("Collectable", "packets that can be collected at that velocity"),
+}
 # The static block's description of an experience.
 EXPERIENCE_NOTE = (
-    "Past decisions are rows without their first number, then > sensor_id velocity: cost, where 0 is best."
+    "Past experiences are the chosen sensor's row without its ID, then > sensor_id velocity: cost, where 0 is best."
 )
 
 
 def columns(features: Features) -> tuple[str, ...]:
     """Names of a row's columns, the sensor's ID first."""
-    return ("sensor_id", *_meanings(features))
+    return tuple(_headings(features))
 
 
-def meanings(features: Features) -> str:
-    """The meaning of each column, in one line."""
-    return " ".join(f"{name}: {meaning}." for name, meaning in _meanings(features).items())
+def introduction(features: Features) -> str:
+    """The static block's names of a row's numbers, which the prefix cache then has, and their meanings."""
+    found = _headings(features).values()
+    meanings = "; ".join(f"{heading}: {meaning}" for heading, meaning in found)
+    return f"{','.join(heading for heading, _ in found)}\n{meanings}."
 
 
 def cells(state: State, rows: Sequence[int] | NDArray[np.int64]) -> list[dict[str, str]]:
-    """The texts of these rows, in this order.
-
-    There is no battery column: the mask excludes a sensor that cannot send.
-    """
-    columns, which = _columns_of(state), np.asarray(rows, dtype=np.int64)
+    """The texts of these rows, in this order."""
+    columns, which = full_columns(state), np.asarray(rows, dtype=np.int64)
     texts = [[str(round(number)) for number in column[which].tolist()] for column in columns.values()]
     return [dict(zip(columns, row, strict=True)) for row in zip(*texts, strict=True)]
 
 
 def full_columns(state: State) -> dict[str, NDArray[Any]]:
-    """Every sensor without pruning and masks, by column ``(J,)``, with the battery.
+    """Every sensor without pruning and masks, by column ``(J,)``.
 
     For a sensor that was never heard, only the columns of ``ALWAYS_KNOWN`` are meaningful.
     """
-    known = _columns_of(state)
-    return {"sensor_id": known["sensor_id"], "queue": known["queue"], "battery": state.battery, **known}
-
-
-def _columns_of(state: State) -> dict[str, NDArray[Any]]:
     columns: dict[str, NDArray[Any]] = {
         "sensor_id": state.ids,
         "queue": state.queue,
+        "battery": state.battery,
         "gain": state.gain,
-        "age": state.since_visit,
         "distance": state.distance,
+        "age": state.since_visit,
+        "urgency": 100.0 * state.urgency,
+        "overflow": 100.0 * state.overflow,
     }
     if state.reach is not None:
         columns |= {"best": state.reach.best, "movable": state.reach.best_packets}
     return columns
 
 
-def introduction(names: tuple[str, ...], order: str) -> str:
-    """The static block's description of a row, with the names of its numbers, which the prefix cache then has."""
-    return f"Each row is one sensor, {order}, with {_NUMERALS[len(names)]} numbers:\n{','.join(names)}"
-
-
 def row(cells: Cells) -> str:
-    """A sensor's line, such as ``3,52,-90,2,140``."""
+    """A sensor's line, such as ``3,52,48,-90,140,2,61,40``."""
     return ",".join(cells.values()) + "\n"
 
 
 def experience(cells: Cells, answer: str, cost: str) -> str:
-    """The line of a past decision, such as ``52,-90,2,140 > 3 7: 0.0``: a row without its ID, the answer, its cost."""
+    """The line of a past decision, such as ``52,48,-90,140,2,61,40 > 3 9: 0.0``: a row without ID, answer, cost."""
     return f"{','.join(text for name, text in cells.items() if name != 'sensor_id')} > {answer}: {cost}\n"
 
 
-def _meanings(features: Features) -> dict[str, str]:
-    return _MEANINGS if features == "paper" else _MEANINGS | _REACH_MEANINGS
+def _headings(features: Features) -> dict[str, tuple[str, str]]:
+    return _PAPER_COLUMNS if features == "paper" else _PAPER_COLUMNS | _REACH_COLUMNS

@@ -17,7 +17,9 @@ def warm_up(settings: Settings) -> WarmUp:
         compact = CompactTemplate(paper, rows=settings.top_k)
         return WarmUp(compact.static, "999999U9a9999999A", compact.labels)
     if settings.mode == "guided":
-        guided = GuidedTemplate(paper, rows=settings.top_k, experiences=settings.experiences, ranked=True)
+        guided = GuidedTemplate(
+            paper, rows=settings.top_k, experiences=settings.most_experiences("guided"), ranked=True
+        )
         return WarmUp(guided.static, guided.content_free()[0], guided.labels)
-    template = Template(paper, experiences=settings.experiences)
-    return WarmUp(template.static, "0,50,-90,1,100\n", None)
+    template = Template(paper, experiences=settings.most_experiences("llm"))
+    return WarmUp(template.static, "UAV at 500,500\n0,50,50,-90,100,1,60,40\n", None)

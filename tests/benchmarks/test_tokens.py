@@ -21,20 +21,22 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Any:
 @pytest.mark.timeout(600)
 def test_the_edges_prompts_are_shorter_than_the_papers(found: Any) -> None:
     tokens = found["tokens"]
-    for way in ("guided", "llm"):
+    for way, most in (("guided", 0.5), ("llm", 1.0)):
         ours, theirs = tokens[way], tokens["paper"]
         assert ours["ratio"]["own"][0] == pytest.approx(ours["own"]["mean"] / theirs["own"]["mean"])
-        assert ours["ratio"]["own"][0] < 0.8
-        assert ours["ratio"]["new"][0] < 0.5
+        assert ours["ratio"]["own"][0] <= most
+        assert ours["ratio"]["new"][0] <= most
         assert ours["new"]["mean"] < ours["own"]["mean"]
     whole, *blocks = (tokens["paper"][name]["mean"] for name in _BLOCKS)
     assert whole == pytest.approx(sum(blocks))
 
 
 @pytest.mark.timeout(600)
-def test_the_papers_state_block_is_about_as_long_as_the_paper_states(found: Any) -> None:
-    stated = found["state_tokens_stated_by_the_paper"]
-    assert 0.85 * stated < found["tokens"]["paper"]["o200k_state"]["mean"] < 1.1 * stated
+def test_the_state_block_by_step_is_longer_with_more_sensors(found: Any) -> None:
+    by_step = found["state_tokens_by_step"]
+    for step, (all_sensors, _) in by_step["all"].items():
+        # The waypoint, and ten rows of 16 tokens, fewer where a sensor was not heard.
+        assert by_step["llm"][step][0] <= by_step["paper"][step][0] < all_sensors < 8 + 10 * 17
 
 
 @pytest.mark.timeout(600)

@@ -17,7 +17,7 @@ from tests.support.waiting import Gate, until
 
 PROBE = "7301"
 # What mode `llm` asks before there is anything to decide.
-FIRST = "0,50,-90,1,100\n"
+FIRST = "UAV at 500,500\n0,50,50,-90,100,1,60,40\n"
 
 
 class StubLlm:

@@ -110,7 +110,7 @@ def test_the_call_is_counted_once(edge: Edge, report: Report) -> None:
         assert 0 < tokens["prompt"] == tokens["state"] < tokens["uncompressed"]
 
 
-@pytest.mark.parametrize("settings", [{}, {"llm_context": 700, "experiences": 0}])
+@pytest.mark.parametrize("settings", [{}, {"llm_context": 1100, "experiences": 0}])
 def test_a_server_that_cannot_is_asked_about_one_after_the_other(
     edge: Edge, report: Report, settings: dict[str, Any]
 ) -> None:

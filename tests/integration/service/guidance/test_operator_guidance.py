@@ -264,7 +264,7 @@ def test_the_note_stands_in_the_static_block_and_nothing_else_changes() -> None:
 
 
 def test_a_note_that_the_context_cannot_hold_is_refused(edge: Edge) -> None:
-    client = edge(mode="llm", llm_url="http://127.0.0.1:9/v1", llm_context=1024)
+    client = edge(mode="llm", llm_url="http://127.0.0.1:9/v1", llm_context=2500)
     assert client.put("/missions/a", json={}).status_code == 200
     # Four bytes a character, and a token each at the worst.
     refused = client.put("/missions/b", json={"note": "\U0001f6a8" * 280})

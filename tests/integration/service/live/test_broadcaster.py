@@ -139,8 +139,8 @@ def test_a_decisions_prompt_is_told_while_it_is_kept(edge: Edge, report: Report)
     client = edge()
     name = decided(client, report())
     told = client.get(f"/missions/test/decisions/{name}/prompt").json()
-    assert told["static"].startswith("You direct a fleet of UAVs")
-    assert told["state"].count("\n") == 5
+    assert told["static"].startswith("You schedule data collection")
+    assert told["state"].count("\n") == 6
     assert told["asked"] is False
     decided(client, report(mission_id="other"))
     for named, decision in (("other", name), ("test", "0" * 32)):

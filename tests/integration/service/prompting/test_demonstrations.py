@@ -39,9 +39,9 @@ def test_none_by_default_and_no_word_of_them() -> None:
 def test_a_prompt_shows_as_many_as_it_is_told(count: int) -> None:
     text = static(shown(count))
     assert text.count("Answer: ") == count
-    assert text.endswith("\n\nAnswer with two whole numbers and nothing else: sensor_id velocity")
+    assert text.split("\n\n")[-1].startswith("Output: exactly two whole numbers")
     # More are the same and then some: the most telling come first.
-    assert static(shown(20)).startswith(text[: text.index("\n\nAnswer with")])
+    assert static(shown(20)).startswith(text[: text.index("\n\nOutput: ")])
 
 
 def test_each_is_what_a_decision_looks_like_and_offers_its_answer() -> None:
@@ -52,7 +52,7 @@ def test_each_is_what_a_decision_looks_like_and_offers_its_answer() -> None:
     for example in examples:
         *rows, answer = example.splitlines()
         offered = [int(row.split(",")[0]) for row in rows]
-        assert all(len(row.split(",")) == 5 for row in rows)
+        assert all(len(row.split(",")) == 8 for row in rows)
         assert 2 <= len(offered) <= 3
         sensor, velocity = map(int, answer.removeprefix("Answer: ").split())
         assert 0 <= velocity <= 14
@@ -62,7 +62,7 @@ def test_each_is_what_a_decision_looks_like_and_offers_its_answer() -> None:
 
 def test_preset_reach_shows_them_with_its_columns() -> None:
     ahead = static(MissionSpec(features="reach", prompt=PromptStyle(demonstrations=2))).split("looks ahead:")[1]
-    assert len(ahead.split()[0].split(",")) == 7
+    assert len(ahead.split()[0].split(",")) == 10
 
 
 def test_shuffled_rows_are_shuffled_in_the_examples_too_by_the_missions_seed() -> None:
@@ -91,7 +91,7 @@ def test_a_slower_fleet_sees_no_velocity_past_its_limit() -> None:
 
 
 def test_twenty_fit_the_embedded_models_context_and_what_does_not_is_refused() -> None:
-    assert mission(shown(20).model_copy(update={"mode": "llm"})).template.static
+    assert mission(shown(20, experiences=8).model_copy(update={"mode": "llm"})).template.static
     with pytest.raises(Refused, match=r"20 demonstrations .* lower prompt.experiences, prompt.demonstrations or top_k"):
         mission(shown(20, experiences=100).model_copy(update={"mode": "llm"}))
 

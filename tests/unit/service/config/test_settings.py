@@ -47,7 +47,7 @@ def test_a_key_read_from_a_file_loses_its_newline_and_never_shows() -> None:
 def test_experiences_that_cannot_fit_the_context_are_refused() -> None:
     with pytest.raises(ValidationError, match="AICVDS_LLM_CONTEXT"):
         Settings(experiences=200)
-    assert Settings(experiences=200, llm_context=8192).experiences == 200
+    assert Settings(experiences=200, llm_context=16_384).experiences == 200
 
 
 @pytest.mark.parametrize("text", ["[1]", "no JSON", '{"a": ', "7"])

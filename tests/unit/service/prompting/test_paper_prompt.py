@@ -1,4 +1,5 @@
 import hashlib
+import re
 from typing import Any, Literal
 
 import pytest
@@ -41,16 +42,16 @@ def test_the_static_block_tells_the_scenarios_numbers() -> None:
 def test_by_default_the_static_block_changes_on_purpose_only() -> None:
     static = mission().template.static
     assert static == Template(PAPER).static
-    assert hashlib.sha256(static.encode()).hexdigest().startswith("a6882f4c33fcbf53")
+    assert hashlib.sha256(static.encode()).hexdigest().startswith("1df9986b1568d9a1")
 
 
 @pytest.mark.parametrize(
     ("max_velocity", "rule"),
     [
-        (14, "8 to 14 beyond 50 m, 1 to 7 within 50 m, 0 at the sensor."),
-        (8, "8 beyond 50 m, 1 to 7 within 50 m, 0 at the sensor."),
-        (5, "5 beyond 50 m, 1 to 5 within 50 m, 0 at the sensor."),
-        (1, "1 beyond 50 m, 1 within 50 m, 0 at the sensor."),
+        (14, "8 to 14 beyond 50 m, 1 to 7 within 50 m, 0 while hovering at it."),
+        (8, "8 beyond 50 m, 1 to 7 within 50 m, 0 while hovering at it."),
+        (5, "5 beyond 50 m, 1 to 5 within 50 m, 0 while hovering at it."),
+        (1, "1 beyond 50 m, 1 within 50 m, 0 while hovering at it."),
     ],
 )
 @pytest.mark.parametrize("features", ["paper", "reach"])
@@ -59,10 +60,8 @@ def test_the_velocity_rule_is_the_papers_up_to_the_worlds_limit(
 ) -> None:
     scenario = PAPER.model_copy(update={"max_velocity": max_velocity})
     static = Template(scenario, features).static
-    rules = static.split("Rules:\n")[1].split("\n\n")[0].splitlines()
-    assert [one for one in rules if "elocity" in one] == [
-        f"3. Velocity, in whole m/s, follows the chosen sensor's distance: {rule}"
-    ]
+    strategy = static.split("Velocity strategy, in whole m/s:\n")[1].split("\n\n")[0].splitlines()
+    assert strategy[0] == f"- By the chosen sensor's distance: {rule}"
     assert "slow" not in static.lower() and "fast" not in static.lower()
 
 
@@ -71,26 +70,30 @@ def test_rows_are_sorted_by_score_and_say_what_is_known() -> None:
     m.records.visits[0] = 4
     view = attended(m, uav(step=6, queue=[30.0, None, 60.0, 15.0]), 6)
     prompt = m.template.prompt(view.state, view.shown(), [])
-    assert [int(line.split(",")[0]) for line in prompt.state.splitlines()] == view.kept_ids
-    assert prompt.uncompressed.text.splitlines() == [
-        "0,30,50,-90,2,0",
-        "1,?,?,?,6,100",
-        "2,60,50,-90,6,200",
-        "3,15,50,-90,6,300",
-    ]
-    assert set(prompt.state.splitlines()) < {"0,30,-90,2,0", "2,60,-90,6,200", "3,15,-90,6,300"}
+    assert prompt.uncompressed.text.splitlines() == (
+        lines := [
+            "UAV at 500,500",
+            "0,30,50,-90,0,2,25,0",
+            "1,?,?,?,100,6,?,?",
+            "2,60,50,-90,200,6,100,100",
+            "3,15,50,-90,300,6,13,0",
+        ]
+    )
+    waypoint, *rows = prompt.state.splitlines()
+    assert waypoint == lines[0]
+    assert rows == [lines[1 + sensor] for sensor in view.kept_ids]
 
 
 def test_experiences_stand_between_static_and_state() -> None:
     last = flown()[-1]
-    line = "20,-90,0,100 > 1 7: 0.1\n"
+    line = "20,50,-90,100,0,17,0 > 1 7: 0.1\n"
     assert last.experiences.startswith(line)
     assert last.user == last.experiences + last.state
 
 
 def test_the_static_block_speaks_of_what_the_mission_shows() -> None:
     static = mission().template.static
-    assert "Past decisions are rows" in static
+    assert "Past experiences are the chosen" in static
     assert "the most promising first" in static
     shuffled = mission(MissionSpec(prompt=PromptStyle(order="shuffled"))).template.static
     assert "the most promising first" not in shuffled
@@ -102,7 +105,7 @@ def test_shuffled_rows_are_the_same_rows_in_an_order_of_seed_step_and_uav() -> N
         m = mission(MissionSpec(prompt=PromptStyle(order="shuffled"), seed=seed))
         view = attended(m, uav(step=step, uav_id=uav_id), step)
         prompt = m.template.prompt(view.state, view.shown(), [])
-        shown = [int(line.split(",")[0]) for line in prompt.state.splitlines()]
+        shown = [int(line.split(",")[0]) for line in prompt.state.splitlines()[1:]]
         assert sorted(shown) == sorted(view.kept_ids)
         return shown
 
@@ -123,7 +126,7 @@ def test_without_attention_every_admissible_sensor_is_shown_in_the_requests_orde
     m = mission(MissionSpec(attention="off", top_k=2, mode="llm"), llm_adapter="off")
     view = attended(m, uav(queue=[30.0, None, 60.0, 15.0]))
     prompt = m.template.prompt(view.state, view.shown(), [])
-    assert [int(line.split(",")[0]) for line in prompt.state.splitlines()] == view.kept_ids == [0, 2, 3]
+    assert [int(line.split(",")[0]) for line in prompt.state.splitlines()[1:]] == view.kept_ids == [0, 2, 3]
     assert "in no particular order" in prompt.static
 
 
@@ -145,14 +148,15 @@ def test_as_many_as_there_are_sensors_are_offered_best_first_or_shuffled() -> No
 def test_no_experiences_means_no_block_and_no_word_of_it() -> None:
     prompts = flown(4, MissionSpec(prompt=PromptStyle(experiences=0)))
     assert [p.experiences for p in prompts] == [""] * 4
-    assert "Past decisions" not in prompts[0].static
+    assert "Past experiences" not in prompts[0].static
 
 
-@pytest.mark.parametrize(("told", "kept"), [(None, 8), (6, 6), (100, 100)])
+@pytest.mark.parametrize(("told", "kept"), [(None, 30), (6, 6), (100, 100)])
 def test_a_mission_says_how_many_experiences_it_keeps(told: int | None, kept: int) -> None:
-    prompts = flown(105, MissionSpec(prompt=PromptStyle(experiences=told)))
+    spec = MissionSpec(mode="llm", prompt=PromptStyle(format="csv", experiences=told))
+    prompts = flown(105, spec, llm_context=8192)
     assert max(len(p.experiences.splitlines()) for p in prompts) == kept
-    status = status_of(mission(MissionSpec(prompt=PromptStyle(experiences=told))))
+    status = status_of(mission(spec, llm_context=8192))
     assert status.prompt.experiences == kept
 
 
@@ -173,3 +177,69 @@ def test_a_prompt_that_cannot_fit_the_context_is_refused(spec: MissionSpec) -> N
         mission(spec)
     assert mission(spec, llm_context=131_072).mode == "llm"
     assert mission(spec.model_copy(update={"mode": "value"})).mode == "value"
+
+
+# The elements of the paper's prompt figure, each with what our template has for it: a pattern, and the block to search.
+FIGURE = {
+    "goal: packet loss over all sensors": r"Goal: lose as few packets as possible over all sensors",
+    "decision 1: one sensor, ID 0-9": r"one ground sensor to collect from \(ID 0 to 9\)",
+    "decision 2: a velocity, 0-14": r"the velocity for the next 10 seconds \(0 to 14 m/s\)",
+    "procedure 1: analyse queue": r"1\. Look at every sensor .*queue",
+    "procedure 1: residual energy": r"1\. Look .*residual energy",
+    "procedure 1: location": r"1\. Look .*location",
+    "procedure 1: channel quality": r"1\. Look .*channel quality \(path loss\)",
+    "procedure 1: time since last visit": r"1\. Look .*time since its last visit",
+    "procedure 1: urgency": r"1\. Look .*urgency",
+    "procedure 1: overflow": r"1\. Look .*overflow probability",
+    "procedure 2: long queue": r"2\. Rank .*long queue",
+    "procedure 2: urgency or overflow": r"2\. Rank .*high urgency or overflow probability",
+    "procedure 2: long without a visit": r"2\. Rank .*long time without a visit",
+    "procedure 2: low energy": r"2\. Rank .*little residual energy",
+    "procedure 2: good channel": r"2\. Rank .*good channel \(low path loss\)",
+    "procedure 3: review past decisions": r"3\. Compare with past decisions",
+    "procedure 4: exactly one of each": r"4\. Choose exactly one sensor and one velocity",
+    "rule: queue": r"- Long queues come first.*overflow",
+    "rule: channel": r"- A better channel \(a higher gain, less path loss\).*succeed",
+    "rule: battery": r"- Collect from a sensor with a low battery before its energy is used up",
+    "rule: urgency and overflow": r"- A high UrgencyScore comes first, above all with a high OverflowProb",
+    "rule: visits": r"- A large TimeSinceLastVisit comes first.*none is neglected",
+    "velocity beyond 50 m": r"8 to 14 beyond 50 m",
+    "velocity within 50 m": r"1 to 7 within 50 m",
+    "velocity while hovering": r"0 while hovering at it",
+    "velocity and travel time": r"higher velocity can shorten the travel time",
+    "cost: packet loss": r"- Packet loss: a poor channel \(high path loss\) loses packets",
+    "cost: overflow": r"- Queue overflow: a queue holds 60 packets; what arrives beyond that is dropped",
+    "task: selected by attention": r"the sensors that attention selected",
+    "columns": "\nSensorID,Queue,BatteryLevel,ChannelGain,Distance,TimeSinceLastVisit,UrgencyScore,OverflowProb\n",
+    "output: two integers": r"Output: exactly two whole numbers with a space between them, sensor_id velocity",
+    "output: nothing else": r"nothing else: no explanation, no reasoning",
+}
+
+
+@pytest.mark.parametrize("element", FIGURE)
+def test_every_element_of_the_papers_figure_is_in_the_prompt(element: str) -> None:
+    static = mission(MissionSpec(mode="llm"), llm_adapter="off").template.static
+    assert re.search(FIGURE[element], static)
+
+
+def test_past_experiences_and_waypoint_come_with_the_decision() -> None:
+    m = mission(MissionSpec(mode="llm"), llm_adapter="off")
+    for step in range(31):
+        view = attended(m, uav(step=step, position=(500.0 + step, 450.0)), step)
+        prompt = m.template.prompt(view.state, view.shown(), m.experiences.block)
+        past = prompt.experiences.splitlines()
+        assert len(past) == step
+        # The previous state in seven numbers, the sensor, the velocity and the cost.
+        assert all(re.fullmatch(r"(-?\d+,){6}\d+ > 1 7: 0\.1", line) for line in past)
+        waypoint, *rows = prompt.state.splitlines()
+        assert waypoint == f"UAV at {500 + step},450"
+        assert rows and all(len(row.split(",")) == 8 for row in rows)
+        m.commit(view.pending(f"{step:032x}", Action(1, 7)))
+        m.apply(Outcome(decision_id=f"{step:032x}", cost=0.125))
+
+
+def test_the_papers_prompt_is_mode_llms_for_a_served_llm_and_compact_with_the_adapter() -> None:
+    served = mission(MissionSpec(mode="llm"), llm_url="http://127.0.0.1:1/v1")
+    assert type(served.template) is Template
+    assert status_of(served).prompt.experiences == 30
+    assert type(mission(MissionSpec(mode="llm")).template) is not Template

@@ -145,13 +145,12 @@ def test_a_row_tells_the_best_velocity_and_what_it_collects() -> None:
     assert view.state.reach is not None
     best, movable = int(view.state.reach.best[0]), int(view.state.reach.best_packets[0])
     prompt = m.template.prompt(view.state, view.shown(), [])
-    assert "with seven numbers:\nsensor_id,queue,gain,age,distance,best,movable\n" in prompt.static
+    assert ",UrgencyScore,OverflowProb,BestVelocity,Collectable\n" in prompt.static
     assert prompt.state.endswith(f",{best},{movable}\n")
-    assert prompt.uncompressed.text.splitlines()[0].startswith("0,60,50,-90,0,")
-    assert prompt.uncompressed.text.splitlines()[1].endswith(",?,?")
+    assert prompt.uncompressed.text.splitlines()[1].startswith("0,60,50,-90,")
+    assert prompt.uncompressed.text.splitlines()[2].endswith(",?,?")
     plain = mission().template.static
-    assert "movable" not in plain
-    assert "with five numbers" in plain
+    assert ",UrgencyScore,OverflowProb\n" in plain and "Collectable" not in plain
 
 
 @pytest.mark.parametrize("scenario", sorted(SCENARIOS))

@@ -90,7 +90,7 @@ def test_the_uncompressed_state_is_counted_as_if_it_were_written(features: Featu
     drawn = random.Random(features)
     queue = [None if drawn.random() < 0.3 else float(int(10 ** drawn.uniform(0, 5)) - 1) for _ in range(300)]
     view = attended(m, uav(step=3000, x=[10 ** drawn.uniform(0, 6) for _ in queue], queue=queue), 3000)
-    for lines in ([], ["20,-90,0,100 > 1 7: 0.1\n"]):
+    for lines in ([], ["20,50,-90,100,0,17,0 > 1 7: 0.1\n"]):
         whole = m.template.prompt(view.state, view.shown(), [], lines).uncompressed
         assert len(whole.text.splitlines()) >= 300
         assert whole.tokens(COUNTER.count) == COUNTER.count(whole.text)
