@@ -3,8 +3,6 @@
 Each is bound to one version of the prompt that it was trained on.
 """
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import NamedTuple

@@ -8,8 +8,6 @@ whose blank is written as another letter (lmdeploy 2802), and null among the tok
 tool call (litellm 6741), and event streams that nobody asked for (unsloth 6570).
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -8,8 +8,6 @@ bias covers both. The bias is measured once for a model, a static block and a nu
 the first decision. The bias of a later list is the one after the labels drawn for the earlier lists.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence

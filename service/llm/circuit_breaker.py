@@ -6,8 +6,6 @@ calls go through again, the first failure opens it for twice as long, and the fi
 :mod:`service.llm.server` decides what counts as a failure.
 """
 
-from __future__ import annotations
-
 import math
 
 _FAILURES = 3

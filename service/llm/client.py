@@ -3,8 +3,6 @@
 The bytes of one response are bounded: aiohttp itself reads response heads without limit, on the event loop.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import logging

@@ -1,7 +1,5 @@
 """Priority of decisions over other requests: the embedded model has one slot."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import time

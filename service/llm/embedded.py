@@ -1,7 +1,5 @@
 """The embedded LLM: llama.cpp in this process, with the HTTP interface of any other server, on loopback."""
 
-from __future__ import annotations
-
 import asyncio
 import secrets
 from collections.abc import Awaitable, Callable, Collection, Iterator

@@ -1,7 +1,5 @@
 """What an LLM server can do: asked as the edge asks it, with one decision, timed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from service.config.settings import Settings

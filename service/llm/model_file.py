@@ -1,7 +1,5 @@
 """The embedded LLM's weights: one file, downloaded and checked, then written in 8 bits."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The request bodies of chat completions, with the fields that constrain a server to the form of the answer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -6,8 +6,6 @@ server has its own health and circuit breaker. Optionally a second server is cal
 request: Dean and Barroso 2013, "The Tail at Scale"). The first answer counts, and the other call is cancelled.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 from collections import Counter, deque

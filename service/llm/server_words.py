@@ -1,7 +1,5 @@
 """A server's own words about a failure: a bounded excerpt without keys."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

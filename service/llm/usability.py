@@ -1,7 +1,5 @@
 """Whether the answers of an LLM server can be used; a healthy server may give only unusable ones."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable

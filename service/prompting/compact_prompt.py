@@ -11,8 +11,6 @@ its sensor's sign, by which the model finds the sensor's earlier outcomes. An ad
 that it was trained on: :data:`service.llm.adapter_version.PROMPT_VERSION` changes whenever a text here does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self

@@ -4,8 +4,6 @@ The file has the edge's knowledge at each decision, not text. So one file serves
 k: a mission shows each example in the format of its own rows. ``python -m lab demonstrate`` makes the file.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache

@@ -19,8 +19,6 @@ The distance of two experiences is the root mean square difference of the attent
 of the distances to each.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The prompt of mode ``guided``: rows of sensors with choice letters, one of which is the LLM's answer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 What never changes comes first, for the LLM server's prefix cache: so the cost function stands before the experiences.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from service.prompting.demonstrations import Solved

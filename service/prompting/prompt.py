@@ -4,8 +4,6 @@ The static block is byte-identical for a mission's life, and the experiences onl
 server with a prefix cache processes only the last block anew. The column names are part of the static block.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from service.prompting.unpruned_state import UnprunedState

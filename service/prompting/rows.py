@@ -1,7 +1,5 @@
 """A sensor's row in the prompt: its columns, as comma-separated numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

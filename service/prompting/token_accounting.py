@@ -1,7 +1,5 @@
 """Token accounting: each block's length, counted offline, the prompt's length without pruning, and its price."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 

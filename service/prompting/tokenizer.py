@@ -1,7 +1,5 @@
 """tiktoken's vocabulary, taken from a package instead of the network."""
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import os

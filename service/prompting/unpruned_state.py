@@ -5,8 +5,6 @@ a row's tokens depend only on which of its numbers are negative or unknown; the 
 every three. Writing and tokenizing many rows would take a hundred times as long.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache

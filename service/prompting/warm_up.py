@@ -1,7 +1,5 @@
 """The warm-up request of an LLM server, with the static block of a mission of default settings."""
 
-from __future__ import annotations
-
 from service.config.settings import Settings
 from service.llm.request_bodies import WarmUp
 from service.prompting.compact_prompt import CompactTemplate

@@ -1,7 +1,5 @@
 """The hand-written policies; but for the random one, all fly at 7 m/s throughout."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 import numpy as np

@@ -4,8 +4,6 @@ The velocity follows the distance to the chosen sensor, by the velocity strategy
 independently; a coordinated scheme also leaves out the sensors that earlier UAVs of the step chose.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 import numpy as np
