@@ -22,7 +22,8 @@ _THOUGHTS = re.compile(rf"\A\s*(?:[<\[]{_TAG}.*?[<\[]/{_TAG}\s*)+", re.DOTALL | 
 _UNCLOSED = re.compile(rf"\A\s*[<\[]{_TAG}", re.IGNORECASE)
 _CLOSING = re.compile(rf"[<\[]/{_TAG}", re.IGNORECASE)
 _FINAL = re.compile(r".*<\|channel\|>final[^<]*<\|message\|>", re.DOTALL)
-_SPECIALS = re.compile(r"(?:\s*(?:<[|\uff5c][^<>]{1,40}[|\uff5c]>|</s>|<end_of_turn>))+\s*\Z")
+_SPECIAL = re.compile(r"(?:<[|\uff5c][^<>]{1,40}[|\uff5c]>|</s>|<end_of_turn>)\Z")
+_LONGEST_SPECIAL = 44
 _WRAPPED = re.compile(r"""\A\s*(?:\*\*(.*)\*\*|"(.*)"|\\boxed\{(.*)\})\s*\Z""", re.DOTALL)
 _ODD_BLANKS = str.maketrans({"\ufeff": None, "\u200b": None, "\u00a0": " "})
 _FENCE = re.compile(r"\A\s*```[a-zA-Z]*\s*\n?(.*?)\n?\s*```\s*\Z", re.DOTALL)
@@ -110,7 +111,7 @@ def streamed(content: bytes | bytearray) -> Any:
 
 def _without_thoughts(text: str) -> str:
     """A text without thoughts, special tokens and marks around its answer; empty if the thoughts have no end."""
-    text = _SPECIALS.sub("", text.translate(_ODD_BLANKS))
+    text = _without_specials(text.translate(_ODD_BLANKS))
     if "<|message|>" in text:
         final = _FINAL.match(text)
         text = text[final.end() :] if final else ""
@@ -122,6 +123,16 @@ def _without_thoughts(text: str) -> str:
     text = fenced[1] if fenced else text
     wrapped = _WRAPPED.match(text)
     return wrapped[wrapped.lastindex or 0] if wrapped else text
+
+
+def _without_specials(text: str) -> str:
+    """A text without the special tokens at its end and the blanks around them, in time linear in its length."""
+    end = whole = len(text.rstrip())
+    while end and (special := _SPECIAL.search(text, max(0, end - _LONGEST_SPECIAL), end)):
+        end = special.start()
+        while end and text[end - 1].isspace():
+            end -= 1
+    return text[:end] if end < whole else text
 
 
 def _counts(usage: Any) -> tuple[int | None, int | None, int | None]:

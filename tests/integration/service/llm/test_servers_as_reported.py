@@ -377,3 +377,22 @@ def test_a_listed_model_that_cannot_chat_is_passed_over(name: str, edge: Edge, r
         client = edge(mode="llm", llm_url=f"{url}/v1")
         assert wait_for(client, "ready")["model"] == "qwen3:8b"
         assert client.post("/decide", json=report()).json()["source"] == "llm"
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        "A<|im_end|>",
+        "[THINK]B, or A?[/THINK]\nA",
+        "<|channel|>analysis<|message|>B?<|end|><|start|>assistant<|channel|>final<|message|>A<|return|>",
+        "**A**",
+        "\\boxed{A}",
+        "\ufeffA",
+    ],
+)
+def test_a_label_is_read_as_two_integers_are(answer: str, edge: Edge, report: Report) -> None:
+    with serving(Plain(lambda body: answer).app) as url:
+        client = edge(mode="guided", llm_url=f"{url}/v1", planner="off")
+        wait_for(client, "ready")
+        decision = client.post("/decide", json=report()).json()
+    assert (decision["source"], decision["reason"]) == ("guided", None)

@@ -74,3 +74,13 @@ def test_no_completion_is_named_in_the_servers_words(body: Any, words: str) -> N
 def test_no_error_quotes_the_key() -> None:
     with pytest.raises(NoDecision, match="bad key \\*\\*\\*"):
         completion_of({"error": {"message": "bad key private-1"}}, "url", ("private-1",))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [" " * 250_000 + "x", "<|im_end|>" * 25_000, "<think>" * 35_000, '"' + '" ' * 125_000 + "x", "```\n" * 60_000],
+    ids=["blanks", "special tokens", "thoughts", "quotes", "fences"],
+)
+def test_a_hostile_text_is_read_in_time_linear_in_its_length(text: str) -> None:
+    # A quadratic reader would take minutes, and the test's time limit ends it.
+    assert completion_of({"choices": [{"message": {"content": text}}]}, "http://llm").text is not None
