@@ -48,7 +48,7 @@ class Attention(nn.Module):
 
 
 class VelocityScorer(nn.Module):
-    """``u = W_2 relu(W_1 [z_j, distance] + b_1) + b_2``, one value for each velocity level, as in the paper."""
+    """``u = W_2 relu(W_1 [z_j, distance] + b_1) + b_2``, one value for each level; the paper leaves it open."""
 
     def __init__(self, levels: int, width: int = WIDTH) -> None:
         super().__init__()
