@@ -4,9 +4,9 @@ Decisions compute with numpy or, for many sensors, :mod:`service.learning.softma
 computations as torch modules, for training offline.
 
 The attention has one head of width d' = 32: ``Q, K, V = X W_q, X W_k, X W_v``; ``Z = softmax(Q K^T / sqrt(d')) V``; a
-sensor's score is ``s = w z + b``. The paper does not give its velocity module's architecture; ours
-in preset ``paper`` is ``u = W_2 relu(W_1 [z, distance] + b_1) + b_2``. In preset ``reach`` the value of the velocity level v is
-``u_v = w_2 relu(W_1 [z, a_v] + b_1) + b_2`` with the same weights for every level, where ``a_v`` is a row of
+sensor's score is ``s = w z + b``. The paper does not give its velocity module's architecture. Ours in
+preset ``paper`` is ``u = W_2 relu(W_1 [z, distance] + b_1) + b_2``. In preset ``reach`` the value of the velocity level
+v is ``u_v = w_2 relu(W_1 [z, a_v] + b_1) + b_2`` with the same weights for every level, where ``a_v`` is a row of
 :meth:`State.approaches`: a scenario may have any number of levels.
 """
 

@@ -1,6 +1,6 @@
 """Differences of a world from the edge's planning model: fields of a scenario that only the simulator reads."""
 
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
@@ -11,7 +11,7 @@ def _off(value: Any, **bounds: Any) -> Any:
 
 
 class Unmodelled(BaseModel):
-    """Deviations from the mean path loss, steady Poisson arrivals and ``velocity x step_s``; none by default.
+    """Deviations from mean path loss, steady Poisson arrivals, ``velocity x step_s`` and beacons; none by default.
 
     The edge receives these fields with the scenario and must not read them: it has to learn their effects from beacons,
     outcomes and positions.
@@ -81,6 +81,11 @@ class Unmodelled(BaseModel):
         "and step (MIL-F-8785C, low altitude: vertical turbulence of a tenth of the wind, horizontal more)",
     )
 
+    observation_model: Literal["beacons", "served"] = _off(
+        "beacons",
+        description="what a UAV observes: the beacons of every sensor in radio range, or as in the paper's protocol "
+        "only the status of the sensor that it served in the step",
+    )
     dead_radios: int = _off(
         0,
         ge=0,

@@ -129,7 +129,7 @@ class VectorWorld:
         # The place among the sensors of all worlds, for each entry of the observations.
         self._sensor_of: IntArray = np.broadcast_to(np.arange(draw.sensors.queue.size).reshape(-1, 1, shape[2]), shape)
         self._surveyed = np.broadcast_to(draw.sensors.positions[:, None], (*shape, 2))
-        return self._observe(*self._links(draw.truth))
+        return self._observe(*self._links(draw.truth), np.zeros(shape, dtype=np.bool_))
 
     def fly(self, chosen: IntArray, velocity: IntArray) -> tuple[Observation, BatchStep]:
         """Fly one step of every world.
@@ -158,7 +158,9 @@ class VectorWorld:
         else:
             cost = failed + blamed / scenario.queue_capacity
         outcome = BatchStep(failed, moved, blamed, -cost, overflows, lost_packets, collected)
-        return self._observe(position, links), outcome
+        status = np.zeros(links.distance_m.shape, dtype=np.bool_)
+        status[(*self._rows, chosen)] = served
+        return self._observe(position, links, status), outcome
 
     def _links(self, truth: Truth) -> tuple[FloatArray, Links]:
         """The UAVs' positions, and the links of every UAV to every sensor, ``(B, I, J)``."""
@@ -166,10 +168,11 @@ class VectorWorld:
         distance = np.hypot(position[..., 0, None] - sensors[..., 0], position[..., 1, None] - sensors[..., 1])
         return position, truth.channel.links(distance, position, self.fleet.progress_m, self.steps_flown)
 
-    def _observe(self, position: FloatArray, links: Links) -> Observation:
-        """Record the beacons in range, and return all observations."""
+    def _observe(self, position: FloatArray, links: Links, served: NDArray[np.bool_]) -> Observation:
+        """Record the beacons in range, or only the status of the sensors served, and return all observations."""
         assert self._truth is not None
-        heard = np.flatnonzero(links.distance_m <= self.scenario.radio_radius_m)
+        beacons = self.scenario.observation_model == "beacons"
+        heard = np.flatnonzero(links.distance_m <= self.scenario.radio_radius_m if beacons else served)
         sensor = self._sensor_of.take(heard)
         self._heard_queue.put(heard, self.sensors.queue.take(sensor))
         self._heard_battery.put(heard, self.sensors.battery.take(sensor))
