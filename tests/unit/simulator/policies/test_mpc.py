@@ -44,8 +44,10 @@ def test_a_policy_that_flew_before_flies_as_a_new_one(short: list[tuple[int, lis
 
 def test_it_loses_far_less_than_eof() -> None:
     world = PipelineWorld()
-    lost = {name: sum(t.lost_packets for t in rollout(world, policy_named(name), 104)) for name in ("mpc", "eof")}
-    assert lost["mpc"] < 0.5 * lost["eof"]
+    lost = {
+        name: sum(t.lost_packets for t in rollout(world, policy_named(name), 104)) for name in ("mpc", "longest_queue")
+    }
+    assert lost["mpc"] < 0.5 * lost["longest_queue"]
 
 
 def test_unobserved_differences_do_not_change_its_decisions() -> None:
@@ -82,8 +84,8 @@ def test_with_nothing_in_reach_it_still_answers() -> None:
 def test_without_a_search_it_still_loses_less_than_eof(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shared.planning.annealing._CHANGES", 1)
     stress = SCENARIOS["stress"].model_copy(update={"steps": 12})
-    eof = sum(t.lost_packets for t in rollout(PipelineWorld(stress), policy_named("eof"), 101))
-    assert sum(lost for lost, _ in flown(stress, 101)) < eof
+    longest = sum(t.lost_packets for t in rollout(PipelineWorld(stress), policy_named("longest_queue"), 101))
+    assert sum(lost for lost, _ in flown(stress, 101)) < longest
 
 
 @pytest.mark.parametrize("changes", [{"sensors": 1, "uavs": 1, "steps": 1}, {"sensors": 1, "uavs": 3, "steps": 3}])
@@ -99,5 +101,5 @@ def test_a_large_fleet_plans_uav_by_uav() -> None:
 @pytest.mark.long
 def test_a_large_fleet_loses_less_than_half_of_eofs() -> None:
     dense = SCENARIOS["dense"].model_copy(update={"steps": 10})
-    eof = sum(t.lost_packets for t in rollout(PipelineWorld(dense), policy_named("eof"), 100))
-    assert sum(lost for lost, _ in flown(dense, 100)) < 0.5 * eof
+    longest = sum(t.lost_packets for t in rollout(PipelineWorld(dense), policy_named("longest_queue"), 100))
+    assert sum(lost for lost, _ in flown(dense, 100)) < 0.5 * longest
