@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shared.world.channel import FloatArray, IntArray, Links
 from shared.world.scenario import SCENARIOS, Scenario

@@ -229,6 +229,8 @@ def test_what_takes_long_is_at_least_understood(command: str, monkeypatch: pytes
         else:
             assert args[0] == "-m"
             patched.setattr(sys, "argv", args[1:])
+            # A test of the same process may have imported it.
+            patched.delitem(sys.modules, args[1], raising=False)
             with pytest.raises(Understood):
                 runpy.run_module(args[1], run_name="__main__", alter_sys=True)
 

@@ -75,7 +75,7 @@ def test_every_setting_and_its_default_is_in_the_table() -> None:
 
 def test_the_example_environment_has_the_real_defaults() -> None:
     lines = (ROOT / ".env.example").read_text()
-    for name in ("top_k", "experiences", "deadline_ms", "llm_context", "max_missions", "max_body_bytes", "mode"):
+    for name in ("top_k", "deadline_ms", "llm_context", "max_missions", "max_body_bytes", "mode"):
         [shown] = re.findall(rf"^#AICVDS_{name.upper()}=(\S+)", lines, re.MULTILINE)
         assert shown == str(getattr(Settings(), name))
 
