@@ -9,6 +9,7 @@ import statistics
 import timeit
 
 import numpy as np
+import tyro
 
 from service.learning.initial_weights import initial_weights
 from shared.features.augmented_state import FEATURES
@@ -25,6 +26,11 @@ def microseconds(sensors: int) -> float:
     return 1e6 * statistics.median(timeit.repeat(lambda: weights.attend(features), number=number, repeat=9)) / number
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Time the attention over 10 to 2,000 sensors."""
     for count in SENSORS:
         print(f"J = {count}: {microseconds(count):.0f} us")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -114,8 +114,11 @@ def test_every_decision_and_sensor_is_reached_by_keyboard(visit: Open, flown: st
     expect(first).to_be_focused()
     page.keyboard.press("Enter")
     dialog = page.get_by_role("dialog", name=re.compile(f"^Step {STEPS - 1}: U\\d to S"))
-    expect(dialog.get_by_role("region", name=re.compile("^Static block"))).to_contain_text("for a fleet of UAVs")
-    expect(dialog.get_by_role("region", name="Current task")).to_have_text(re.compile(r"^(\d+(,-?\d+){6}\s*){5}$"))
+    expect(dialog.get_by_role("region", name=re.compile("^Static block"))).to_contain_text(
+        "You schedule data collection"
+    )
+    task = re.compile(r"^UAV at -?\d+,-?\d+\s+(\d+(,-?\d+){9}\s*){5}$")
+    expect(dialog.get_by_role("region", name="Current task")).to_have_text(task)
     expect(dialog.locator("tr.chosen")).to_have_count(1)
     expect(dialog.locator("tbody tr")).to_have_count(5)
     expect(dialog).to_contain_text("No LLM was asked")
