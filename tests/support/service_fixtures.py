@@ -14,9 +14,12 @@ def made_missions(made_on_decide: None) -> None:
     """Only test_unknown_missions.py is about edges by default."""
 
 
-@pytest.fixture(autouse=True, scope="session")
+@pytest.fixture(autouse=True, scope="module")
 def briefly_planned() -> Iterator[None]:
-    """The planner searches in one run: its plans' quality is the subject of the simulator's tests."""
+    """The planner searches in one run: its plans' quality is the subject of the simulator's tests.
+
+    For a module: later tests of the same process, and their own processes, plan as the edge does.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("shared.planning.receding._RUNS", [(0, 0.05)])
         yield

@@ -112,7 +112,7 @@ def test_another_mode_prompt_and_k_are_compared_and_different_decisions_are_not_
         "top_k": (5, 2),
         "features": (None, "reach"),
         "init": ("pretrained", "random"),
-        "prompt.experiences": (8, 4),
+        "prompt.experiences": (30, 4),
         "prompt.selection": ("recent", "best"),
     }
     assert list(again.by_source)[0] == "value"
