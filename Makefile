@@ -48,7 +48,8 @@ demo: .venv/demo
 COMPILE = $(BIN)/python -c 'from service.edge.compilation import compile_all; compile_all()'
 # The variable is that of `aicvds serve`, here before torch is loaded: llama.cpp's threads share the cores with other
 # tests, and would spin while one waits for the other.
-# Three workers on two cores: many tests wait for processes, browsers and pauses.
+# Three workers on two cores: many tests wait for processes, browsers and pauses. The long tests compute, and those that
+# start Ray's clusters ran out of patience beside two others.
 WORKERS ?= $(shell echo $$(( ($$(getconf _NPROCESSORS_ONLN) * 3 + 1) / 2 )))
 PYTEST = GOMP_SPINCOUNT=1000 $(BIN)/pytest --numprocesses $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
@@ -56,6 +57,7 @@ test: install
 	$(COMPILE)
 	$(PYTEST)
 
+test-long: WORKERS = auto
 test-long: install
 	$(COMPILE)
 	$(PYTEST) -m long
