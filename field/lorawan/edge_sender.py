@@ -41,7 +41,7 @@ class EdgeSender:
         transport: httpx.BaseTransport | None = None,
         retry_s: float = 5.0,
     ) -> None:
-        # A retry would send what is old by then: the next call sends the newest readings.
+        # No retry: its readings would be old by then, and the next call sends the newest ones.
         self._client = EdgeClient(edge, timeout_s=_TIMEOUT_S, attempts=1, api_key=key, transport=transport)
         self._pending = pending
         self._metrics = metrics

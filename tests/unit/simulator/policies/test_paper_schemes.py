@@ -36,7 +36,7 @@ def test_eof_observes_the_growth_of_each_queue() -> None:
     policy.decide(0, seen([10, 30, 0, 0], [5] * 4), NONE)
     # Sensor 0 overflows in two steps, sensor 1 in five although its queue is as long.
     assert policy.decide(0, seen([40, 40, 0, 0], [7] * 4, now=7), NONE)[0] == 0
-    # The queues are collected from: the growth stays what was observed.
+    # A collection empties the queues, and the observed growth stays.
     assert policy.decide(0, seen([10, 10, 0, 0], [8] * 4, now=8), NONE)[0] == 0
     # Another UAV has not observed it: of equals the first in range.
     assert policy.decide(1, seen([40, 40, 41, 0], [8] * 4, now=8), NONE)[0] == 2
