@@ -11,6 +11,7 @@ tool call (litellm 6741), and event streams that nobody asked for (unsloth 6570)
 import json
 import math
 import re
+from string import ascii_letters
 from typing import Any
 
 from service.llm.answers import Completion, NoDecision, TokenPosition
@@ -23,10 +24,9 @@ _UNCLOSED = re.compile(rf"\A\s*[<\[]{_TAG}", re.IGNORECASE)
 _CLOSING = re.compile(rf"[<\[]/{_TAG}", re.IGNORECASE)
 _FINAL = re.compile(r".*<\|channel\|>final[^<]*<\|message\|>", re.DOTALL)
 _SPECIAL = re.compile(r"(?:<[|\uff5c][^<>]{1,40}[|\uff5c]>|</s>|<end_of_turn>)\Z")
-_LONGEST_SPECIAL = 44
+_LONGEST_SPECIAL, _FENCE = 44, "```"
 _WRAPPED = re.compile(r"""\A\s*(?:\*\*(.*)\*\*|"(.*)"|\\boxed\{(.*)\})\s*\Z""", re.DOTALL)
 _ODD_BLANKS = str.maketrans({"\ufeff": None, "\u200b": None, "\u00a0": " "})
-_FENCE = re.compile(r"\A\s*```[a-zA-Z]*\s*\n?(.*?)\n?\s*```\s*\Z", re.DOTALL)
 # A blank and the end of a line in the vocabularies of GPT-2 and SentencePiece.
 _BLANKS = str.maketrans({"Ġ": " ", "▁": " ", "Ċ": "\n"})
 
@@ -119,10 +119,17 @@ def _without_thoughts(text: str) -> str:
         text = _THOUGHTS.sub("", text)
         # Some chat templates open the thoughts in the prompt, so that the answer has the closing tag alone.
         text = "" if _UNCLOSED.match(text) else _CLOSING.split(text)[-1].lstrip()
-    fenced = _FENCE.match(text) if "```" in text else None
-    text = fenced[1] if fenced else text
+    text = _without_fence(text)
     wrapped = _WRAPPED.match(text)
     return wrapped[wrapped.lastindex or 0] if wrapped else text
+
+
+def _without_fence(text: str) -> str:
+    """The content of a text that is one fenced block; else the text. In linear time, for any number of newlines."""
+    block = text.strip()
+    if len(block) < 2 * len(_FENCE) or not (block.startswith(_FENCE) and block.endswith(_FENCE)):
+        return text
+    return block[len(_FENCE) : -len(_FENCE)].lstrip(ascii_letters).strip()
 
 
 def _without_specials(text: str) -> str:

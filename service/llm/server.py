@@ -110,7 +110,7 @@ class LlmServer:
             model=connection.model,
             constraint=connection.abilities.constraint if ready else None,
             abilities=str(connection) if ready else None,
-            decision_ms=round(connection.decision_s * 1e3, 1) if ready else None,
+            decision_ms=round(connection.decision_s * 1e3, 1) if ready and connection.decision_s else None,
             detail=self.usability.degraded if ready else self.status.detail,
         )
 

@@ -67,10 +67,9 @@ def pause_of(headers: Mapping[str, str]) -> float | None:
         seconds = float(value)
     except ValueError:
         try:
-            until = parsedate_to_datetime(value)
-        except ValueError:
+            seconds = parsedate_to_datetime(value).timestamp() - time.time()
+        except (ValueError, OverflowError):
             return None
-        seconds = until.timestamp() - time.time()
     return min(max(seconds, _SHORTEST_PAUSE_S), _LONGEST_PAUSE_S) if math.isfinite(seconds) else None
 
 

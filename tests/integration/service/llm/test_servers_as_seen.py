@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -355,3 +356,21 @@ def test_readyz_says_how_the_server_answers_and_what_it_demands(edge: Edge) -> N
         ready["abilities"] == f"answers as text that the edge checks, no token probabilities, one UAV a call; {demands}"
     )
     assert ready["decision_ms"] > 0
+
+
+def test_a_server_whose_first_answer_is_of_no_use_has_no_decision_to_time(edge: Edge) -> None:
+    with serving(Plain(lambda body: "no idea").app) as url:
+        assert wait_for(edge(mode="llm", llm_url=f"{url}/v1"), "ready")["decision_ms"] is None
+
+
+def test_a_decision_that_takes_longer_than_the_deadline_is_warned_of(
+    edge: Edge, caplog: pytest.LogCaptureFixture
+) -> None:
+    def thinks_slowly(body: Body) -> str:
+        time.sleep(0.05)
+        return "0 7"
+
+    with serving(Plain(thinks_slowly).app) as url:
+        ready = wait_for(edge(mode="llm", llm_url=f"{url}/v1", deadline_ms=10), "ready")
+    assert ready["decision_ms"] >= 50
+    assert "LLM too slow: a decision took" in caplog.text

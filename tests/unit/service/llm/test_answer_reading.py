@@ -78,8 +78,16 @@ def test_no_error_quotes_the_key() -> None:
 
 @pytest.mark.parametrize(
     "text",
-    [" " * 250_000 + "x", "<|im_end|>" * 25_000, "<think>" * 35_000, '"' + '" ' * 125_000 + "x", "```\n" * 60_000],
-    ids=["blanks", "special tokens", "thoughts", "quotes", "fences"],
+    [
+        " " * 250_000 + "x",
+        "<|im_end|>" * 25_000,
+        "<think>" * 35_000,
+        '"' + '" ' * 125_000 + "x",
+        "```\n" * 60_000,
+        "```json" + "\n" * 250_000 + "x",
+        "```" + " \n" * 120_000 + "0 7",
+    ],
+    ids=["blanks", "special tokens", "thoughts", "quotes", "fences", "an open fence", "blanks in an open fence"],
 )
 def test_a_hostile_text_is_read_in_time_linear_in_its_length(text: str) -> None:
     # A quadratic reader would take minutes, and the test's time limit ends it.

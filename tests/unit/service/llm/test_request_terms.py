@@ -81,7 +81,18 @@ def test_an_excerpt_is_short_readable_and_without_keys(content: bytes, expected:
 
 @pytest.mark.parametrize(
     ("value", "seconds"),
-    [("3", 3.0), ("0.5", 0.5), ("0", 0.1), ("-4", 0.1), ("1e9", 480.0), ("nan", None), ("soon", None), ("", None)],
+    [
+        ("3", 3.0),
+        ("0.5", 0.5),
+        ("0", 0.1),
+        ("-4", 0.1),
+        ("1e9", 480.0),
+        ("nan", None),
+        ("soon", None),
+        ("", None),
+        (f"Fri, 31 Dec {9 * 10**20} 00:00:00 GMT", None),
+        (f"Fri, 31 Dec 2020 00:00:00 +{10**20}", None),
+    ],
 )
 def test_a_pause_is_bounded_and_nonsense_is_none(value: str, seconds: float | None) -> None:
     assert pause_of({"Retry-After": value} if value else {}) == seconds
