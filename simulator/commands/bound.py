@@ -8,14 +8,14 @@ from rich.console import Console
 from tyro.conf import arg
 
 from simulator.bound.clairvoyant_bound import clairvoyant, confirmed
-from simulator.commands.options import check_between, check_seed, site_from_options
+from simulator.commands.options import WorldOptions, check_between, site_of
 from simulator.commands.running import command_main
 from simulator.records.record import Record
 from simulator.records.run_folder import naming_out
 
 
 @dataclass(frozen=True)
-class BoundOptions:
+class BoundOptions(WorldOptions):
     """Find the least packets that any fleet could have lost in one world.
 
     A planner that knows every arrival beforehand, as no UAV does, searches for the best flight with OR-Tools CP-SAT and
@@ -36,14 +36,6 @@ class BoundOptions:
     ends the search, and the best so far is printed. Exit code: 0 done, also by Ctrl-C; 2 bad use.
     """
 
-    seed: Annotated[int, arg(metavar="N")] = 0
-    """Seed of the world, 0 to 4294967295."""
-    scenario: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """A ready-made world: paper (the default), stress, shadowed and others; `aicvds simulate --help` lists them."""
-    world: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """A world of your own, instead of --scenario; `aicvds simulate --help` describes the folder."""
-    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Waypoints to fly, 1 to 10000. Default: the scenario's (30)."""
     time_limit_s: Annotated[float, arg(metavar="S")] = 60.0
     """Seconds of search at most, 0.1 to 86400."""
     out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -71,9 +63,8 @@ def main(argv: list[str]) -> int:
 
 
 def _run(options: BoundOptions, console: Console) -> int:
-    site = site_from_options(options.scenario, options.world, options.steps)
+    site = site_of(options)
     scenario = site.scenario
-    check_seed(options.seed)
     check_between("--time-limit-s", options.time_limit_s, 0.1, 86_400)
     if options.out is not None:
         with naming_out(options.out):

@@ -1,6 +1,5 @@
 """``aicvds demo``: an edge, its LLM and a whole mission on this machine, in one command."""
 
-import os
 import shlex
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -10,18 +9,16 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, arg
 
-from simulator.commands.options import check_between, check_seed, check_wait, site_from_options
+from simulator.commands.options import WorldOptions, check_between, check_wait, site_of
 from simulator.commands.running import command_main
 from simulator.flying.job import BOUND_S, Job, new_mission_id
-from simulator.flying.local_edge import HOST, check_alive, edge_process, usable_port
+from simulator.flying.local_edge import edge_in_folder
 from simulator.flying.run import run_mission
 from simulator.records.run_folder import REPORT, fresh_folder, refuse_old_result
 
-EDGE_LOG = "edge.log"
-
 
 @dataclass(frozen=True)
-class Demo:
+class Demo(WorldOptions):
     """Start an edge on this machine, fly a mission against it, and compare with EOF and WQCS.
 
     The edge loads its LLM (the embedded one, or that of the AICVDS_LLM_* variables), decides for three UAVs at thirty
@@ -35,13 +32,6 @@ class Demo:
 
     out: Path = Path("runs/demo")
     """Folder to write to, made if missing."""
-    seed: int = 0
-    """Seed of the world, 0 to 4294967295; the same seed gives the same world."""
-    scenario: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """A ready-made world: paper (the default), stress, shadowed and others; `aicvds simulate --help`
-    describes them."""
-    world: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """A folder with a world of your own, instead of --scenario; `aicvds simulate --help` describes its files."""
     port: int = 0
     """Port of the edge on 127.0.0.1, 0 to 65535; 0 picks a free one."""
     wait_s: float = 300.0
@@ -64,33 +54,24 @@ def demo(options: Demo, command: str, console: Console) -> int:
         UsageError: the options are unusable, or the folder cannot be written.
         EdgeError: the edge died at start, or never became ready.
     """
-    site = site_from_options(options.scenario, options.world)
-    check_seed(options.seed)
+    site = site_of(options)
     check_wait(options.wait_s)
     check_between("--port", options.port, 0, 65_535)
     refuse_old_result(options.out, overwrite=True)
-    port = usable_port(options.port)
     fresh_folder(options.out)
-
-    job = Job(
-        site=site,
-        seed=options.seed,
-        mission_id=new_mission_id(site.scenario, options.seed),
-        out=options.out,
-        command=command,
-        edge=f"http://{HOST}:{port}",
-        wait_s=options.wait_s,
-        bound_s=BOUND_S if options.bound and find_spec("ortools") is not None else 0.0,
-        reference="policy",
-    )
-    log = options.out / EDGE_LOG
-    # A store of its own, apart from that of another edge on this machine.
-    environment = {**os.environ, "AICVDS_STORE": str(options.out.resolve() / "missions.db")}
-    with edge_process(port, log, environment) as process:
-        console.print(
-            f"Started an edge on port {port}; its log is {log}", markup=False, highlight=False, soft_wrap=True
+    with edge_in_folder(options.out, console, port=options.port) as (edge, alive):
+        job = Job(
+            site=site,
+            seed=options.seed,
+            mission_id=new_mission_id(site.scenario, options.seed),
+            out=options.out,
+            command=command,
+            edge=edge,
+            wait_s=options.wait_s,
+            bound_s=BOUND_S if options.bound and find_spec("ortools") is not None else 0.0,
+            reference="policy",
         )
-        code = run_mission(job, console, alive=lambda: check_alive(process, log))
+        code = run_mission(job, console, alive=alive)
     if code == 0:
         console.print(_next_steps(options.out), markup=False, highlight=False, soft_wrap=True)
     return code

@@ -8,6 +8,8 @@ from shared.wire.schemas import Mode, Uplink
 from shared.world.scenario import Scenario
 from simulator.sites.site import Site
 
+BASELINES = ("eof", "wqcs")
+EDGE_MODE = "edge:"
 # Seconds of search for the bound on a mission's losses. Scenario `paper` takes about one.
 BOUND_S = 10.0
 
@@ -21,11 +23,13 @@ def new_mission_id(scenario: Scenario, seed: int) -> str:
 class Job:
     """The settings of one simulated mission.
 
-    ``policy`` is ``edge`` or a local policy's name, and then ``edge`` is ``None``. A ``named`` mission may exist at the
-    edge before the flight. ``note`` is the operator's. Before take-off the mission waits,
-    at most ``wait_s`` seconds, while the LLM's state is one of ``wait_out``. After the flight the bound on its losses
-    is searched for ``bound_s`` seconds at most; 0 searches none. ``reference`` is a mode without an LLM in which the
-    same edge flies the same world once more, after a mission whose mode has one.
+    ``policy`` is ``edge`` or a local policy's name, and then ``edge`` is asked for the comparison alone. A ``named``
+    mission may exist at the edge before the flight. ``note`` is the operator's. Before take-off the mission waits, at
+    most ``wait_s`` seconds, while the LLM's state is one of ``wait_out``. After the flight the bound on its losses is
+    searched for ``bound_s`` seconds at most; 0 searches none. ``reference`` is a mode without an LLM in which the same
+    edge flies the same world once more, after a mission whose mode has one. The policies ``against`` fly the same world
+    for comparison: local ones, and modes of the edge as ``edge:MODE``. With ``pace`` a step takes as long as in the
+    world, divided by ``pace``.
     """
 
     site: Site
@@ -45,3 +49,5 @@ class Job:
     reconnect_s: float = 0.0
     bound_s: float = BOUND_S
     reference: Mode | None = None
+    against: tuple[str, ...] = BASELINES
+    pace: float | None = None

@@ -1,19 +1,24 @@
 """An edge in a process on this machine."""
 
+import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from rich.console import Console
+
 from shared.client.errors import EdgeError
+from shared.wire.schemas import Mode
 from simulator.errors import UsageError
 from simulator.records.run_folder import naming_out
 
 STOP_S = 10.0
 TAIL_LINES = 15
 HOST = "127.0.0.1"
+EDGE_LOG = "edge.log"
 
 
 class EdgeDied(EdgeError):
@@ -45,6 +50,34 @@ def edge_process(
             yield process
         finally:
             _stop(process)
+
+
+@contextmanager
+def edge_in_folder(
+    out: Path, console: Console, mode: Mode | None = None, port: int = 0
+) -> Iterator[tuple[str, Callable[[], None]]]:
+    """Within the context, run an edge whose log and store are in ``out``.
+
+    Args:
+        out: an existing folder.
+        mode: of missions without one of their own; None: that of this process's environment.
+        port: on the loopback; 0 picks a free one.
+
+    Yields:
+        The edge's URL, and a function that raises :class:`EdgeDied` if the edge has ended.
+
+    Raises:
+        UsageError: the port is in use, or the folder cannot be written.
+    """
+    port, log = usable_port(port), out / EDGE_LOG
+    # A store of its own, apart from that of another edge on this machine.
+    environment = {**os.environ, "AICVDS_STORE": str(out.resolve() / "missions.db")}
+    environment |= {} if mode is None else {"AICVDS_MODE": mode}
+    with edge_process(port, log, environment) as process:
+        console.print(
+            f"Started an edge on port {port}; its log is {log}", markup=False, highlight=False, soft_wrap=True
+        )
+        yield f"http://{HOST}:{port}", lambda: check_alive(process, log)
 
 
 def _stop(process: subprocess.Popen[bytes]) -> None:

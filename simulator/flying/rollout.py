@@ -1,19 +1,22 @@
 """One mission flown by a local policy."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+from simulator.flying.job import BASELINES
 from simulator.policies.policy import LearningPolicy, Policy
 from simulator.policies.registry import policy_named
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import StepTally
 
-BASELINES = ("eof", "wqcs")
 
+def baselines(site: Site, seed: int, steps: int, names: Sequence[str] = BASELINES) -> dict[str, list[StepTally]]:
+    """Local policies, by default the paper's EOF and WQCS, on the same site and seed.
 
-def baselines(site: Site, seed: int, steps: int) -> dict[str, list[StepTally]]:
-    """The paper's EOF and WQCS on the same site and seed: the tallies of the first ``steps`` steps by policy."""
-    flown = {name: rollout(site.world(), policy_named(name), seed) for name in BASELINES}
+    Returns:
+        The tallies of the first ``steps`` steps by policy.
+    """
+    flown = {name: rollout(site.world(), policy_named(name), seed) for name in names}
     return {name: tally[:steps] for name, tally in flown.items()}
 
 

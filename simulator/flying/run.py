@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections import Counter
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Console
 from rich.markup import escape
@@ -13,10 +14,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 
 from shared.client.edge_client import EdgeClient
 from shared.client.errors import EdgeError
-from shared.wire.schemas import LLM_MODES
+from shared.wire.schemas import LLM_MODES, Mode
 from simulator.errors import INTERRUPTED
 from simulator.flying.edge_session import await_edge, create_or_check_mission, job_client, probe_client, radio_link
-from simulator.flying.job import Job
+from simulator.flying.job import EDGE_MODE, Job
 from simulator.records.flight import Flight
 from simulator.records.mission_logs import DecisionLog, RequestLog, with_edge_defaults
 from simulator.records.operator import OperatorRecord, recount_deadlines
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from simulator.flying.flight_metrics import FlightMetrics
     from simulator.flying.pilots import Pilot, PilotChoice
     from simulator.records.flight import Flight
+    from simulator.world.observation import StepTally
 
 
 def run_mission(
@@ -45,10 +47,10 @@ def run_mission(
     """
     from simulator.flying.pilots import EdgePilot, LocalPilot
 
-    if job.edge is None:
+    if job.edge is None or job.policy != "edge":
         fresh_folder(job.out)
         flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console, _ProgressText(metrics))
-        return _write_results(job, flight, None, None, {}, console)
+        return _write_results(job, flight, _others(job, flight, console, alive), None, None, {}, console)
     lossy = radio_link(job.site.scenario, job.seed)
     with (
         job_client(job, job.edge) as ground,
@@ -74,9 +76,12 @@ def run_mission(
             pilot.on_request = requests.append
             flight = _fly(job, pilot, console, progress)
         operator = _operator(probe, job.mission_id, flight)
-        again = _fly_reference(job, ground, console) if created.mode in LLM_MODES and not flight.interrupted else None
-    extra = {"operator": operator, "without_llm": again}
-    code = _write_results(job, flight, created.mode, model, extra, console)
+        again = None
+        if job.reference and created.mode in LLM_MODES and not flight.interrupted:
+            again = _fly_again(job, job.reference, ground, console)
+        others = _others(job, flight, console, alive)
+    extra = {"operator": operator, "without_llm": None if again is None else sum(t.lost_packets for t in again)}
+    code = _write_results(job, flight, others, created.mode, model, extra, console)
     if pilot.last_error is not None:
         unanswered = len(flight.decisions) - pilot.answered
         print(
@@ -141,9 +146,14 @@ def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Fligh
         task = progress.add_task("Flying", total=job.site.scenario.steps, text="")
         text.show_with(lambda shown: progress.update(task, text=shown))
 
+        began = time.monotonic()
+
         def stepped(flight: Flight) -> None:
             progress.advance(task)
             text.on_step(flight)
+            if job.pace is not None:
+                due = began + flight.steps_flown * job.site.scenario.step_s / job.pace
+                time.sleep(max(0.0, due - time.monotonic()))
 
         flight = fly(job.site, pilot, job.seed, log, text.on_decision, stepped)
     if flight.interrupted:
@@ -151,29 +161,46 @@ def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Fligh
     return flight
 
 
-def _fly_reference(job: Job, edge: EdgeClient, console: Console) -> int | None:
-    """The packets that the same edge loses in the same world in the job's reference mode; ``None`` if it fails."""
+def _fly_again(job: Job, mode: Mode, edge: EdgeClient, console: Console) -> list[StepTally] | None:
+    """The tallies of the same world flown by the same edge in another mode; ``None`` if that fails."""
     from simulator.flying.flight import fly
     from simulator.flying.pilots import EdgePilot
 
-    if job.reference is None:
-        return None
-    mission_id = f"{job.mission_id}-{job.reference}"
-    pilot = EdgePilot(edge, mission_id, job.site.scenario, job.seed, mode=job.reference, deadline_ms=job.deadline_ms)
+    mission_id = f"{job.mission_id}-{mode}"
+    pilot = EdgePilot(edge, mission_id, job.site.scenario, job.seed, mode=mode, deadline_ms=job.deadline_ms)
     with Progress(*_columns(), console=console) as progress:
-        task = progress.add_task(f"Flying again, mode {job.reference}", total=job.site.scenario.steps, text="")
+        task = progress.add_task(f"Flying again, mode {mode}", total=job.site.scenario.steps, text="")
 
         def stepped(flight: Flight) -> None:
             progress.advance(task)
 
         try:
             edge.put_mission(mission_id, pilot.spec)
-        except EdgeError:
+        except EdgeError as error:
+            print(f"mode {mode} was not flown: {error}", file=sys.stderr)
             return None
         flight = fly(job.site, pilot, job.seed, on_step=stepped)
     if flight.interrupted or pilot.answered < len(flight.decisions):
         return None
-    return sum(tally.lost_packets for tally in flight.tally)
+    return flight.tally
+
+
+def _others(job: Job, flight: Flight, console: Console, alive: Callable[[], None]) -> dict[str, list[StepTally]]:
+    """The tallies of the policies to compare with, over the steps flown; a mode that failed is left out."""
+    from simulator.flying.rollout import baselines
+
+    modes = [name.partition(":")[2] for name in job.against if name.startswith(EDGE_MODE)]
+    local = [name for name in job.against if not name.startswith(EDGE_MODE)]
+    flown = baselines(job.site, job.seed, flight.steps_flown, local)
+    if job.edge is None or not modes or flight.interrupted:
+        return flown
+    with job_client(job, job.edge) as edge:
+        await_edge(edge, job.wait_s, console, alive, job.wait_out)
+        for mode in modes:
+            tally = _fly_again(job, cast(Mode, mode), edge, console)
+            if tally is not None:
+                flown[f"{EDGE_MODE}{mode}"] = tally[: flight.steps_flown]
+    return flown
 
 
 def _operator(probe: EdgeClient, mission_id: str, flight: Flight) -> OperatorRecord | None:
@@ -202,18 +229,21 @@ def _with_bound(job: Job, flight: Flight, summary: Summary, console: Console) ->
 
 
 def _write_results(
-    job: Job, flight: Flight, mode: str | None, model: str | None, extra: Mapping[str, Any], console: Console
+    job: Job,
+    flight: Flight,
+    others: Mapping[str, Sequence[StepTally]],
+    mode: str | None,
+    model: str | None,
+    extra: Mapping[str, Any],
+    console: Console,
 ) -> int:
     """Summarise, with these further fields of the summary, write and print; returns the exit code."""
-    from simulator.flying.rollout import baselines
-
     flown_by = "aic_vds" if job.policy == "edge" else job.policy
-    others = baselines(job.site, job.seed, flight.steps_flown)
     tallies = {flown_by: flight.tally, **{name: tally for name, tally in others.items() if name != flown_by}}
     facts = flight.facts(
         policy=job.policy,
-        edge=job.edge,
-        uplink=job.uplink if job.edge else None,
+        edge=job.edge if job.policy == "edge" else None,
+        uplink=job.uplink if job.policy == "edge" else None,
         mission_id=job.mission_id,
         mode=mode,
         model=model,

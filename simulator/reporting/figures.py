@@ -37,6 +37,10 @@ POLICIES = {
     "max_gain": (RED, "--", ">"),
     "nearest": (GREY, "-.", "X"),
     "mpc": (INK, "-", "h"),
+    "edge:llm": (BLUE, "--", "P"),
+    "edge:guided": (PURPLE, "-", "P"),
+    "edge:value": (GREEN, "-", "v"),
+    "edge:policy": (RED, "-", "D"),
 }
 OTHER_POLICY = (GREY, "-", "x")
 SOURCES = {"llm": BLUE, "guided": PURPLE, "value": GREEN, "policy": ORANGE, "onboard": RED}
@@ -223,7 +227,7 @@ def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> Pap
             axes.set_ylim(bottom=0)
         for axes in panels[2:]:
             axes.set_xlabel("step")
-        _legend_above(panels[0], max(1, len(tallies)))
+        _legend_above(panels[0], min(max(1, len(tallies)), 3))
     return drawn
 
 

@@ -11,6 +11,7 @@ import pytest
 from shared.wire.schemas import MissionSpec
 from shared.world.scenario import SCENARIOS
 from simulator.commands import simulate
+from simulator.flying import run
 from simulator.records.mission_logs import read_decisions
 from simulator.records.run_folder import DRAWN
 from simulator.records.summary import LossBound, Summary
@@ -84,6 +85,51 @@ def test_a_local_policy_is_reported_under_its_own_name(tmp_path: Path) -> None:
     assert summary.edge is None and summary.by_source.onboard == 6
 
 
+OWN_POLICY = """
+from own_part import VELOCITY
+
+class Fullest:
+    def reset(self, scenario, seed):
+        pass
+
+    def decide(self, uav, observation, taken):
+        return int(observation["queue"].argmax()), VELOCITY
+"""
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_an_own_policy_flies_beside_modes_of_an_edge_started_for_it(tmp_path: Path) -> None:
+    (tmp_path / "own_part.py").write_text("VELOCITY = 3", "utf-8")
+    (tmp_path / "fullest_of_mine.py").write_text(OWN_POLICY, "utf-8")
+    policy, out = f"{tmp_path}/fullest_of_mine.py:Fullest", tmp_path / "run"
+    arguments = ["--against", "edge:value", "--against", "round_robin", "--sensors", "6", "--uavs", "2"]
+    assert simulate.main(["--policy", policy, *arguments, "--no-bound", "--steps", "2", "--out", str(out)]) == 0
+    summary = summary_in(out)
+    assert set(summary.lost_packets) == {policy, "eof", "wqcs", "edge:value", "round_robin"}
+    assert (summary.scenario, summary.decisions, summary.edge) == ("paper_changed", 4, None)
+    assert {decision.velocity for decision in read_decisions(out / "decisions.jsonl")} == {3}
+    assert (out / "edge.log").exists()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_mode_of_a_running_edge_flies_for_comparison(stub: EdgeStub, tmp_path: Path) -> None:
+    arguments = ["--edge", stub.url, "--against", "edge:policy", "--steps", "1", "--out", str(tmp_path)]
+    assert simulate.main(arguments) == 0
+    summary = summary_in(tmp_path)
+    assert set(summary.lost_packets) == {"aic_vds", "eof", "wqcs", "edge:policy"}
+    assert {spec.mode for spec in stub.missions.values()} == {None, "policy"}
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_paced_flight_takes_the_worlds_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr(run.time, "sleep", slept.append)
+    monkeypatch.setattr(run.time, "monotonic", lambda: 100.0)
+    arguments = ["--policy", "eof", "--no-bound", "--steps", "3", "--pace", "4x", "--out", str(tmp_path)]
+    assert simulate.main(arguments) == 0
+    assert slept == [2.5, 5.0, 7.5]
+
+
 def test_the_bound_is_searched_unless_it_is_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,6 +200,15 @@ def test_a_mission_that_does_not_fit_is_refused(
         (["--edge", "http://e", "--reconnect-s", "-1"], "--reconnect-s -1"),
         (["--edge", "http://e", "--policy", "eof"], "--policy eof asks no edge"),
         (["--policy", "eof", "--uplink", "delta"], "--uplink delta means nothing"),
+        (["--policy", "edge:magic"], "--policy edge:magic: choose one of edge:llm, edge:guided, edge:value"),
+        (["--policy", "edge:llm", "--mode", "value"], "--policy edge:llm and --mode value contradict"),
+        (["--policy", "eof", "--against", "edge"], "--against edge: say in which mode"),
+        (["--policy", "eof", "--against", "magic"], "--against magic: choose one of"),
+        (["--policy", "eof", "--against", "none.py:Mine"], "policy none.py:Mine: there is no file none.py"),
+        (["--policy", f"{__file__}:Mine"], f"{__file__} has no Mine"),
+        (["--policy", "eof", "--pace", "0x"], "--pace 0x: write real, or how many times faster"),
+        (["--policy", "eof", "--pace", "fast"], "--pace fast: write real"),
+        (["--policy", "eof", "--sensors", "0"], "--sensors 0: must be greater"),
         (["--policy", "eof", "--mode", "llm"], "--mode llm means nothing"),
         (["--policy", "eof", "--note", "x"], "--note x means nothing"),
         (["--edge", "http://e", "--mission", "a b"], "--mission 'a b'"),
