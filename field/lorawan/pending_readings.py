@@ -1,18 +1,24 @@
 """A broker's messages: the newest reading of each device is buffered for the edge, and every message is counted."""
 
+import logging
 import math
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from itertools import islice
 from typing import Any, Literal
 
 from pydantic import ValidationError
+from pydantic_core import from_json
 
 from field.lorawan.configuration import Configuration, Device
 from field.lorawan.mqtt_metrics import MqttMetrics
 from field.lorawan.uplinks import DECODERS, DeviceMessage
+from shared.kit.validation_messages import problem_of
+
+log = logging.getLogger(__name__)
 
 # The largest LoRaWAN payload has 242 bytes; the metadata of many gateways is some kilobytes.
 _MAX_BYTES = 65_536
@@ -20,6 +26,11 @@ _MAX_BYTES = 65_536
 _MAX_CLOCK_SKEW = timedelta(seconds=60)
 # Message IDs remembered for each device, to detect duplicates.
 _REMEMBERED_IDS = 8
+# Warnings at most, one a device and reason: anyone at the broker can make up devices.
+_MOST_WARNINGS = 10_000
+# Field names in a warning, and characters of each.
+_NAMES_SHOWN, _NAME_LENGTH = 20, 60
+_EPOCH = datetime.min.replace(tzinfo=UTC)
 
 MessageResult = Literal[
     "accepted", "battery", "duplicate", "foreign", "future", "no_queue", "outdated", "simulated", "too_large",
@@ -44,9 +55,10 @@ class _DeviceState:
     """A device's newest message, and the battery level that the network reported."""
 
     device: Device
-    newest: datetime = datetime.min.replace(tzinfo=UTC)
+    newest: datetime = _EPOCH
     messages: deque[str] = field(default_factory=lambda: deque(maxlen=_REMEMBERED_IDS))
     battery_percent: float | None = None
+    battery_at: datetime = _EPOCH
 
 
 class ReadingBuffer:
@@ -62,52 +74,67 @@ class ReadingBuffer:
         self._devices = {device.dev_eui.lower(): _DeviceState(device) for device in configuration.device}
         self._lock = threading.Lock()
         self._readings: dict[tuple[str, int], PendingReading] = {}
+        self._warned: set[tuple[str, MessageResult]] = set()
 
-    def add_message(self, payload: bytes, now: datetime | None = None) -> MessageResult:
-        """Decode a message and buffer its reading; returns and counts the result."""
+    def add_message(self, payload: bytes, now: datetime | None = None, topic: str = "") -> MessageResult:
+        """Decode a message and buffer its reading; returns and counts the result.
+
+        A message that cannot be used is logged once a device and reason, with the names of its fields.
+        """
         with self._lock:
-            result = self._result_of(payload, now or datetime.now(UTC))
+            result = self._result_of(payload, now or datetime.now(UTC), topic)
             self._metrics.waiting.set(len(self._readings))
         self._metrics.uplinks.labels(result).inc()
         return result
 
-    def _result_of(self, payload: bytes, now: datetime) -> MessageResult:
+    def _result_of(self, payload: bytes, now: datetime, topic: str) -> MessageResult:
         if len(payload) > _MAX_BYTES:
-            return "too_large"
+            return self._unused(topic, "too_large", f"it has {len(payload)} bytes")
         try:
             uplink = self._decode(payload)
-        except (ValidationError, ValueError, OverflowError):
-            return "unreadable"
-        network = self._configuration.network
+        except (ValidationError, ValueError, OverflowError) as error:
+            return self._unused(topic, "unreadable", _fault(payload, error))
+        eui, network = uplink.dev_eui, self._configuration.network
         if uplink.application != network.application or (network.tenant and uplink.tenant != network.tenant):
-            return "foreign"
-        state = self._devices.get(uplink.dev_eui)
+            reason = f"its application is {_shown(uplink.application)}, its tenant {_shown(uplink.tenant)}"
+            return self._unused(eui, "foreign", reason)
+        state = self._devices.get(eui)
         if state is None:
-            return "unknown_device"
+            return self._unused(eui, "unknown_device", "the file has no [[device]] with this dev_eui")
         if uplink.simulated:
             return "simulated"
+        age_s = (now - uplink.at).total_seconds()
         if uplink.at > now + _MAX_CLOCK_SKEW:
-            return "future"
+            return self._unused(eui, "future", f"it is {-age_s:.0f} s ahead of this machine's clock")
         if uplink.message_id in state.messages:
             return "duplicate"
-        if uplink.battery_percent is not None:
-            state.battery_percent = uplink.battery_percent
+        if uplink.has_battery and uplink.at >= state.battery_at:
+            state.battery_at, state.battery_percent = uplink.at, uplink.battery_percent
         if uplink.fields is None:
             return "battery"
-        if (now - uplink.at).total_seconds() > network.max_age_s:
-            return "too_old"
+        if age_s > network.max_age_s:
+            return self._unused(eui, "too_old", f"it is {age_s:.0f} s old")
         if uplink.at <= state.newest:
             return "outdated"
-        return self._add_reading(uplink, state, uplink.fields)
+        return self._add_reading(uplink, state)
 
-    def _add_reading(self, uplink: DeviceMessage, state: _DeviceState, fields: Mapping[str, Any]) -> MessageResult:
+    def _unused(self, device: str, result: MessageResult, reason: str) -> MessageResult:
+        if (device, result) not in self._warned and len(self._warned) < _MOST_WARNINGS:
+            self._warned.add((device, result))
+            log.warning("%s: %s: %s; further ones are only counted", _shown(device), result, reason)
+        return result
+
+    def _add_reading(self, uplink: DeviceMessage, state: _DeviceState) -> MessageResult:
         payload = self._configuration.payload
-        queue = _number(fields, payload.queue)
+        queue = _number(uplink.fields, payload.queue)
         if queue is None or queue < 0:
-            return "no_queue"
+            found = _field(uplink.fields, payload.queue)
+            wrong = f"field {_shown(payload.queue)} is {'missing' if found is None else _shown(found)}"
+            has = _has(_paths(uplink.fields)) if uplink.fields else "the network server has no decoder for its bytes"
+            return self._unused(uplink.dev_eui, "no_queue", f"{wrong}; {has}")
         percent = state.battery_percent
         if payload.battery is not None:
-            own = _number(fields, payload.battery)
+            own = _number(uplink.fields, payload.battery)
             percent = own if own is not None and 0 <= own <= 100 else percent
         full_j = payload.battery_full_j
         state.newest = uplink.at
@@ -156,13 +183,9 @@ class ReadingBuffer:
             self._metrics.waiting.set(len(self._readings))
 
 
-def _number(fields: Mapping[str, Any], name: str) -> float | None:
-    """A number in the decoded payload by its name, with dots for nested objects; None where there is none."""
-    value: Any = fields
-    for part in name.split("."):
-        if not isinstance(value, Mapping):
-            return None
-        value = value.get(part)
+def _number(fields: Any, name: str) -> float | None:
+    """A number in the decoded payload by its name; None where there is none."""
+    value = _field(fields, name)
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -170,3 +193,48 @@ def _number(fields: Mapping[str, Any], name: str) -> float | None:
     except OverflowError:
         return None
     return number if math.isfinite(number) else None
+
+
+def _field(value: Any, name: str) -> Any:
+    """A part of the decoded payload: dots lead into objects and lists, unless a field's own name has them."""
+    if isinstance(value, list):
+        head, _, rest = name.partition(".")
+        part = value[int(head)] if head.isdecimal() and int(head) < len(value) else None
+        return _field(part, rest) if rest else part
+    if not isinstance(value, Mapping):
+        return None
+    if name in value:
+        return value[name]
+    splits = (at for at, letter in enumerate(name) if letter == "." and name[:at] in value)
+    found = (_field(value[name[:at]], name[at + 1 :]) for at in splits)
+    return next((part for part in found if part is not None), None)
+
+
+def _paths(value: Any, before: str = "") -> Iterator[str]:
+    """The names of a payload's values, as the file may name them."""
+    if not isinstance(value, Mapping | list):
+        yield before
+        return
+    for name, part in value.items() if isinstance(value, Mapping) else enumerate(value):
+        yield from _paths(part, f"{before}.{name}" if before else str(name))
+
+
+def _fault(payload: bytes, error: Exception) -> str:
+    """What is wrong with a message, and the names of its fields at the top level."""
+    if not isinstance(error, ValidationError):
+        return "a value cannot be read"
+    first = error.errors(include_url=False)[0]
+    if first["type"] == "json_invalid":
+        return "it is no JSON"
+    message = from_json(payload)
+    names = message if isinstance(message, Mapping) else ()
+    return f"{'.'.join(map(str, first['loc']))} {problem_of(first)}; {_has(names)}"
+
+
+def _has(names: Iterable[str]) -> str:
+    return f"it has {', '.join(_shown(name) for name in islice(names, _NAMES_SHOWN)) or 'no fields'}"
+
+
+def _shown(text: object) -> str:
+    """A broker's text for the log: quoted, on one line."""
+    return repr(text)[:_NAME_LENGTH]

@@ -72,7 +72,7 @@ def test_an_address_has_the_usual_port_unless_it_names_one(tmp_path: Path, url: 
         ("mqtt://localhost", "mqtt://localhost:70000", "broker.url: must be mqtt://host"),
         ('"chirpstack"', '"chirp"', "network.server: "),
         ('application = "ae', 'application = "+/ae', "network.application: "),
-        ('queue = "queue"', 'queue = ".queue"', "payload.queue: "),
+        ('queue = "queue"', 'queue = ""', "payload.queue: "),
         ('queue = "queue"', 'queues = "queue"', "payload.queue: is missing"),
         ("battery_full_j = 50", 'battery = "b"', "payload: battery_full_j is missing"),
         ("battery_full_j = 50", "battery_full_j = nan", "payload.battery_full_j: "),

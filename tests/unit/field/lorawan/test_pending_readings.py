@@ -220,3 +220,177 @@ def test_nonsense_is_unreadable_and_breaks_nothing(server: str, payload: bytes) 
 def test_deeply_nested_json_is_unreadable(tmp_path: Path) -> None:
     message = packed(chirpstack_up()).replace(b'"queue": 17', b'"queue": ' + b"[" * 5000 + b"]" * 5000)
     assert reading_buffer().add_message(message, NOW) in ("unreadable", "no_queue")
+
+
+ODD = (None, "x", -1, 3.5, True, [], {}, [None], ["x"], [{"rssi": "x", "snr": {}}], {"value": "x"}, 10**400, "\u202e")
+CHIRPSTACK_METADATA = [
+    *("deduplicationId", "fCnt", "fPort", "rxInfo", "txInfo", "devAddr", "adr", "dr", "confirmed", "data", "margin"),
+    *("batteryLevel", "batteryLevelUnavailable", "externalPowerSource"),
+]
+THINGS_METADATA = [
+    *("f_cnt", "f_port", "rx_metadata", "settings", "last_battery_percentage", "session_key_id", "frm_payload"),
+    *("consumed_airtime", "packet_error_rate", "locations"),
+]
+
+
+@pytest.mark.parametrize("odd", ODD)
+@pytest.mark.parametrize("name", CHIRPSTACK_METADATA)
+def test_metadata_of_chirpstack_never_costs_a_queue(name: str, odd: object) -> None:
+    pending = reading_buffer()
+    assert take(pending, chirpstack_up(**{name: odd})) == "accepted"
+    assert [reading.queue for reading in waiting(pending)] == [17.0]
+
+
+@pytest.mark.parametrize("odd", ODD)
+@pytest.mark.parametrize("name", THINGS_METADATA)
+def test_metadata_of_the_things_stack_never_costs_a_queue(name: str, odd: object) -> None:
+    pending, message = reading_buffer("the-things-stack"), the_things_stack_up()
+    message["uplink_message"][name] = odd
+    message["correlation_ids"] = message["simulated"] = None
+    assert take(pending, message) == "accepted"
+    assert [reading.queue for reading in waiting(pending)] == [17.0]
+
+
+def test_the_things_stacks_other_time_counts_where_the_uplink_has_none() -> None:
+    pending, message = reading_buffer("the-things-stack"), the_things_stack_up()
+    del message["uplink_message"]["received_at"]
+    assert take(pending, message) == "accepted"
+
+
+LATER = {"at": NOW + timedelta(seconds=10), "f_cnt": 2}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"externalPowerSource": True, "batteryLevel": 0},
+        {"batteryLevelUnavailable": True, "batteryLevel": 0},
+        {"batteryLevel": None},
+        {"batteryLevel": 255},
+        {"batteryLevel": "full"},
+        {"batteryLevel": float("nan")},
+    ],
+)
+def test_a_battery_that_chirpstack_no_longer_knows_is_unknown(changes: dict[str, Any]) -> None:
+    pending = reading_buffer()
+    assert take(pending, chirpstack_status(batteryLevel=80.0)) == "battery"
+    assert take(pending, chirpstack_status(at=NOW + timedelta(seconds=5), **changes), 6) == "battery"
+    assert take(pending, chirpstack_up(**LATER), 11) == "accepted"
+    assert [reading.battery for reading in waiting(pending)] == [None]
+
+
+def test_a_status_with_nothing_but_its_margin_is_an_unknown_battery() -> None:
+    pending = reading_buffer()
+    assert take(pending, chirpstack_status(batteryLevel=80.0)) == "battery"
+    status = chirpstack_status(at=NOW + timedelta(seconds=5))
+    for name in ("batteryLevel", "batteryLevelUnavailable", "externalPowerSource"):
+        del status[name]
+    assert take(pending, status, 6) == "battery"
+    assert take(pending, chirpstack_up(**LATER), 11) == "accepted"
+    assert [reading.battery for reading in waiting(pending)] == [None]
+
+
+def test_an_older_status_that_comes_later_changes_no_battery() -> None:
+    pending = reading_buffer()
+    assert take(pending, chirpstack_status(batteryLevel=40.0, at=NOW + timedelta(seconds=5)), 6) == "battery"
+    assert take(pending, chirpstack_status(batteryLevel=80.0), 7) == "battery"
+    assert take(pending, chirpstack_up(**LATER), 11) == "accepted"
+    assert [reading.battery for reading in waiting(pending)] == [20.0]
+
+
+@pytest.mark.parametrize(
+    ("battery", "joules"),
+    [({"f_cnt": 1}, None), ({"value": None}, None), (None, None), ({"value": 101}, None), ({"value": 0}, 0.0)],
+)
+def test_a_battery_of_the_things_stack_without_a_value_is_unknown(battery: object, joules: float | None) -> None:
+    pending = reading_buffer("the-things-stack")
+    assert take(pending, the_things_stack_up()) == "accepted"
+    message = the_things_stack_up(**LATER)
+    message["uplink_message"]["last_battery_percentage"] = battery
+    assert take(pending, message, 11) == "accepted"
+    assert [reading.battery for reading in waiting(pending)] == [joules]
+    del message["uplink_message"]["last_battery_percentage"]
+    message["uplink_message"]["received_at"] = "2026-11-23T12:00:20Z"
+    assert take(pending, message, 21) == "accepted"
+    assert [reading.battery for reading in waiting(pending)] == [None]
+
+
+@pytest.mark.parametrize(
+    ("name", "fields"),
+    [
+        ("level.queue", {"level": {"queue": 7}}),
+        ("Queue length (packets)", {"Queue length (packets)": 7}),
+        ("Water level.Now", {"Water level": {"Now": 7}}),
+        ("sensors.1.level", {"sensors": [{"level": 1}, {"level": 7}]}),
+        ("0.queue", [{"queue": 7}]),
+        ("messages.0.1.value", {"messages": [[{"value": 1}, {"value": 7}]]}),
+        ("niv.", {"niv.": 7}),
+        ("a.b", {"a.b": 7, "a": {"b": 3}}),
+        ("a.b.c", {"a.b": {"c": 7}, "a": {"b": {}}}),
+        ("a.b.c", {"a": {"b.c": 7}}),
+        ("\u6c34\u4f4d", {"\u6c34\u4f4d": 7}),
+        (" ", {" ": 7}),
+    ],
+)
+def test_whatever_a_decoder_calls_its_field(name: str, fields: object) -> None:
+    pending = reading_buffer(queue=name)
+    assert take(pending, chirpstack_up(object=fields)) == "accepted"
+    assert [reading.queue for reading in waiting(pending)] == [7.0]
+
+
+@pytest.mark.parametrize("name", ["2.queue", "-1.queue", "queue", "0", "0.queue.x", ".", "\u00b2.queue"])
+def test_a_field_that_a_list_lacks_is_no_queue(name: str) -> None:
+    assert take(reading_buffer(queue=name), chirpstack_up(object=[{"queue": 7}])) == "no_queue"
+
+
+V3 = {"applicationID": "1", "applicationName": "p", "devEUI": "0004a30b001c0530", "data": "EUI=", "object": {}}
+EUI = dev_eui(0)
+
+
+@pytest.mark.parametrize(
+    ("message", "said"),
+    [
+        (V3, "'up/1': unreadable: time is missing; it has 'applicationID', 'applicationName', 'devEUI', 'data'"),
+        (chirpstack_up(time="noon"), "'up/1': unreadable: time must be a valid date"),
+        (b"\xff", "'up/1': unreadable: it is no JSON"),
+        (b"[1]", "'up/1': unreadable"),
+        (b"7", "'up/1': unreadable"),
+        (b"x" * 70_000, "'up/1': too_large: it has 70000 bytes"),
+        (chirpstack_up(object=None), f"'{EUI}': no_queue: field 'queue' is missing; the network server has no decoder"),
+        (
+            chirpstack_up(object={"level": {"queue": 3}, "list": [1, {"x": 2}]}),
+            f"'{EUI}': no_queue: field 'queue' is missing; it has 'level.queue', 'list.0', 'list.1.x'",
+        ),
+        (chirpstack_up(queue="3 pk\n\u202e"), "no_queue: field 'queue' is '3 pk\\n\\u202e'; it has 'queue'"),
+        (chirpstack_up(queue=-4), "no_queue: field 'queue' is -4; "),
+        (chirpstack_up(device=9), f"'{dev_eui(9)}': unknown_device: the file has no [[device]] with this dev_eui"),
+        (chirpstack_up(time="2026-11-23T13:00:01Z"), f"'{EUI}': future: it is 3600 s ahead of this machine's clock"),
+        (chirpstack_up(time="2026-11-23T10:00:01Z"), f"'{EUI}': too_old: it is 7200 s old"),
+        (
+            chirpstack_up(deviceInfo={"applicationId": "a\nb", "devEui": EUI}),
+            f"'{EUI}': foreign: its application is 'a\\nb', its tenant None",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_logged_once_a_device_and_reason(
+    message: dict[str, Any] | bytes, said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    pending = reading_buffer()
+    for _ in range(3):
+        pending.add_message(
+            message if isinstance(message, bytes) else packed(message), NOW + timedelta(seconds=1), "up/1"
+        )
+    (line,) = caplog.messages
+    assert said in line and "\n" not in line and len(line) < 1500
+    assert take(pending, chirpstack_up(device=1)) == "accepted"
+    assert len(caplog.messages) == 1
+
+
+def test_made_up_devices_do_not_flood_the_log(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("field.lorawan.pending_readings._MOST_WARNINGS", 5)
+    pending = reading_buffer()
+    for number in range(10, 30):
+        assert take(pending, chirpstack_up(device=number)) == "unknown_device"
+    assert len(caplog.messages) == 5
