@@ -8,6 +8,7 @@ from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from shared.kit.text_files import UnusableFile, text_of
 from shared.kit.validation_messages import problem_of
 from shared.wire.schemas import MissionId, SensorId
 
@@ -148,18 +149,15 @@ def read_configuration(path: Path, broker_url: str | None = None) -> Configurati
         ConfigurationError: the file or one that it names cannot be read, or a field is wrong.
     """
     try:
-        with path.open("rb") as file:
-            raw = file.read(_MAX_BYTES + 1)
-        if len(raw) > _MAX_BYTES:
-            raise ConfigurationError(f"{path} is larger than {_MAX_BYTES} bytes")
-        found = Configuration.model_validate(_with_broker(tomllib.loads(raw.decode()), broker_url))
-    except OSError as error:
-        raise ConfigurationError(f"{path}: {error.strerror or error}") from None
+        found = Configuration.model_validate(_with_broker(tomllib.loads(text_of(path, _MAX_BYTES)), broker_url))
+    except UnusableFile as error:
+        raise ConfigurationError(str(error)) from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
         known = [name for table in (Broker, Network, Payload, Device, Configuration) for name in table.model_fields]
-        raise ConfigurationError(f"{path}: {field}{': ' if field else ''}{problem_of(first, known)}") from None
+        problem = problem_of(first, known).replace("a JSON object", "a table")
+        raise ConfigurationError(f"{path}: {field}{': ' if field else ''}{problem}") from None
     except (ValueError, RecursionError) as error:
         raise ConfigurationError(f"{path} is no TOML: {' '.join(str(error).split())}") from None
     files: dict[str, Path] = {}

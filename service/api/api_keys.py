@@ -20,6 +20,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from shared.kit.text_files import UnusableFile, text_of
 from shared.kit.validation_messages import problem_of
 
 log = logging.getLogger(__name__)
@@ -33,6 +34,7 @@ _PREFIX = "aicvds_"
 # Seconds between checks for changes of the file.
 _STALE_S = 1.0
 MOST_KEYS = 1000
+_MAX_BYTES = 4_000_000
 
 
 class BadKeys(Exception):
@@ -61,9 +63,9 @@ class KeyFile(BaseModel):
     def read(cls, path: Path) -> KeyFile:
         """Read the file; raises ``BadKeys``."""
         try:
-            return cls.model_validate_json(path.read_bytes())
-        except OSError as error:
-            raise BadKeys(f"{path}: {error.strerror or error}") from None
+            return cls.model_validate_json(text_of(path, _MAX_BYTES))
+        except UnusableFile as error:
+            raise BadKeys(str(error)) from None
         except ValidationError as error:
             fault = error.errors()[0]
             at = ".".join(map(str, fault["loc"])) or "the file"

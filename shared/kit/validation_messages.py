@@ -14,6 +14,23 @@ _PLAIN = {
     "model_type": "must be a JSON object",
     "model_attributes_type": "must be a JSON object",
     "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "bool_type": "must be true or false",
+    "union_tag_invalid": "is of an unknown type",
+    "union_tag_not_found": "has no type",
+}
+# The words for the patterns of fields.
+_PATTERNS = {
+    r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$": "1 to 64 letters, digits, `.`, `_` and `-`, with a letter or digit first",
+    r"^[A-Za-z0-9_.-]{1,64}$": "1 to 64 letters, digits, `_`, `.` and `-`",
+    r"^[0-9A-Za-z_-]{1,64}$": "1 to 64 letters, digits, `_` and `-`",
+    r"^[A-Za-z0-9-]{1,64}$": "1 to 64 letters, digits and `-`",
+    r"^[a-z][a-z0-9_]{0,31}$": "1 to 32 lower-case letters, digits and `_`, with a letter first",
+    r"^[\x21-\x7e]{1,64}$": "1 to 64 printable ASCII characters without spaces",
+    r"^[^/+#@\s]{1,100}$": "1 to 100 characters without spaces and `/ + # @`",
+    r"^[0-9A-Fa-f]{16}$": "16 hexadecimal digits",
+    r"^[0-9a-f]{32}$": "32 hexadecimal digits in lower case",
+    r"^[0-9a-f]{64}$": "64 hexadecimal digits in lower case",
 }
 
 
@@ -29,9 +46,13 @@ def problem_of(error: Mapping[str, Any], known: Collection[str] = ()) -> str:
     if error["type"] == "extra_forbidden":
         return f"there is no such field{suggestion(str(error['loc'][-1]), known)}"
     text = _PLAIN.get(error["type"], str(error["msg"]))
+    if error["type"] == "string_pattern_mismatch" and error["ctx"]["pattern"] in _PATTERNS:
+        text = f"must be {_PATTERNS[error['ctx']['pattern']]}"
+    elif error["type"] == "json_invalid":
+        text = f"is no JSON: {error['ctx']['error']}"
     for prefix in _PREFIXES:
         text = text.removeprefix(prefix)
-    return _SUBJECT.sub("must ", text)
+    return _SUBJECT.sub("must ", text).replace(" after validation", "")
 
 
 def suggestion(name: str, known: Collection[str]) -> str:

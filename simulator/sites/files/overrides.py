@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from shared.kit.validation_messages import problem_of
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
 from simulator.sites.files.reading import quoted, text_of
@@ -39,8 +40,7 @@ class Overrides:
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             key = str(first["loc"][0]) if first["loc"] else ""
-            message = str(first["ctx"]["error"]) if first["type"] == "value_error" else first["msg"]
-            raise UsageError(f"{self.at(key)}: {key}{': ' if key else ''}{message[0].lower()}{message[1:]}") from None
+            raise UsageError(f"{self.at(key)}: {key}{': ' if key else ''}{problem_of(first)}") from None
 
     def at(self, key: str) -> str:
         """The file and the line that sets a key, for messages."""

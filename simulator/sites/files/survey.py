@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails, from_json
 
+from shared.kit.validation_messages import problem_of
 from shared.world.scenario import MAX_SENSORS, Point
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence, FenceRole
@@ -199,10 +200,8 @@ def _error_text(error: ErrorDetails) -> str:
         return "geometry.coordinates: a Point needs a longitude and a latitude, a LineString at least two positions"
     if error["type"] == "too_long" and where.startswith("geometry.coordinates"):
         return f"{where} is too long; a position has two or three numbers, a line at most {MAX_WAYPOINTS} positions"
-    if error["type"] == "value_error":
-        return f"{where}: {error['ctx']['error']}"
-    message = error["msg"]
-    return f"{where or 'the feature'}: {message[0].lower()}{message[1:]}, not {quoted(error['input'])}"
+    shown = "" if error["type"] == "value_error" else f", not {quoted(error['input'])}"
+    return f"{where or 'the feature'}: {problem_of(error)}{shown}"
 
 
 def _add(survey: Survey, label: str, feature: _Feature) -> None:

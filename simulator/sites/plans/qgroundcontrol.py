@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from shared.kit.validation_messages import problem_of
 from shared.world.scenario import Point
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence
@@ -235,6 +236,5 @@ def _error_text(error: ValidationError) -> str:
     if first["type"] == "extra_forbidden" or where == "geoFence.version":
         fault = f"is {first['input']}" if where == "geoFence.version" else "is not known"
         return f"{where} {fault}; a geofence of version 2 is read: open the plan in QGroundControl and save it again"
-    message = first["msg"]
     shown = "" if first["type"] == "missing" else f", not {quoted(first['input'])}"
-    return f"{where}: {message[0].lower()}{message[1:]}{shown}"
+    return f"{where}: {problem_of(first)}{shown}"

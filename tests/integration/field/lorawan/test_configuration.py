@@ -102,6 +102,47 @@ def test_files_for_tls_are_beside_the_file(tmp_path: Path) -> None:
     assert found.broker.ca_file == tmp_path / "ca.crt"
 
 
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+@pytest.mark.parametrize("end", [b"\n", b"\r\n"])
+def test_a_file_of_another_system_is_read_the_same(tmp_path: Path, mark: bytes, end: bytes) -> None:
+    path = tmp_path / "lorawan.toml"
+    path.write_bytes(mark + TEXT.encode().replace(b"\n", end))
+    assert read_configuration(path) == read_configuration(EXAMPLE)
+
+
+def test_a_file_in_utf_16_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "lorawan.toml"
+    path.write_bytes(TEXT.encode("utf-16"))
+    with pytest.raises(ConfigurationError, match=r"lorawan\.toml, line 1: not UTF-8; save the file as UTF-8"):
+        read_configuration(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"0004a30b001c0531"', '"xyz"', "device[1].dev_eui: must be 16 hexadecimal digits"),
+        (
+            'mission = "patrol"',
+            'mission = "pa trol"',
+            "mission: must be 1 to 64 letters, digits, `.`, `_` and `-`",
+        ),
+        ('application = "ae', 'application = "+/ae', "network.application: must be 1 to 100 characters without spaces"),
+        (
+            'url = "mqtt://',
+            'client_id = "a b"\nurl = "mqtt://',
+            "broker.client_id: must be 1 to 64 letters, digits",
+        ),
+        ("sensor_id = 1", "sensor_id = 1.5", "device[1].sensor_id: must be a valid integer"),
+        ("battery_full_j = 50", "battery_full_j = 0", "payload.battery_full_j: must be greater than 0"),
+        ("[broker]", "broker = 3\n[brokers]", "broker: must be a table"),
+    ],
+)
+def test_a_fault_is_told_in_plain_words(tmp_path: Path, old: str, new: str, said: str) -> None:
+    with pytest.raises(ConfigurationError) as error:
+        read(tmp_path, (old, new))
+    assert str(error.value).startswith(f"{tmp_path / 'lorawan.toml'}: {said}")
+
+
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="No such file"):
         read_configuration(tmp_path / "none.toml")

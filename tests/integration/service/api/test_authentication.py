@@ -134,7 +134,7 @@ def test_a_file_that_cannot_be_read_for_a_while_is_read_when_it_can(tmp_path: Pa
     keys = ApiKeys(path, clock=lambda: now[0])
     made(path, other=("decide",))
     with monkeypatch.context() as patched:
-        patched.setattr(Path, "read_bytes", lambda self: (_ for _ in ()).throw(PermissionError(13, "denied")))
+        patched.setattr(Path, "open", lambda *_: (_ for _ in ()).throw(PermissionError(13, "denied")))
         now[0] = 2.0
         assert keys.find(leaked) is not None
     now[0] = 4.0
@@ -208,7 +208,7 @@ def test_the_command_makes_lists_and_removes(tmp_path: Path, capsys: pytest.Capt
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["add", "two words"], "name: must match pattern"),
+        (["add", "two words"], "name: must be 1 to 64 letters, digits, "),
         (["add", "fleet", "--per-minute", "0"], "per_minute: must be greater than or equal to 1"),
         (["add", "fleet", "--scopes"], "scopes: "),
         (["list"], "No such file"),
@@ -225,7 +225,7 @@ def test_bad_use_is_one_clear_line(
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [("[]", "the file: "), ('{"keys": [{"name": "a"}]}', "keys.0.scopes: "), ("nonsense", "the file: Invalid JSON")],
+    [("[]", "the file: "), ('{"keys": [{"name": "a"}]}', "keys.0.scopes: "), ("nonsense", "the file: is no JSON: ")],
 )
 def test_a_broken_file_is_named_and_never_quoted(tmp_path: Path, content: str, said: str) -> None:
     (tmp_path / "keys.json").write_text(content)
@@ -233,6 +233,13 @@ def test_a_broken_file_is_named_and_never_quoted(tmp_path: Path, content: str, s
         ApiKeys(tmp_path / "keys.json")
     assert f"keys.json: {said}" in str(caught.value)
     assert "nonsense" not in str(caught.value)
+
+
+def test_keys_of_another_systems_editor_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "keys.json"
+    key = made(path, fleet=("decide",))["fleet"]
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    assert ApiKeys(path).find(key) is not None
 
 
 def test_the_guard_stands_before_the_body(edge: Edge, tmp_path: Path) -> None:

@@ -222,7 +222,21 @@ def test_deeply_nested_json_is_unreadable(tmp_path: Path) -> None:
     assert reading_buffer().add_message(message, NOW) in ("unreadable", "no_queue")
 
 
-ODD = (None, "x", -1, 3.5, True, [], {}, [None], ["x"], [{"rssi": "x", "snr": {}}], {"value": "x"}, 10**400, "\u202e")
+ODD: tuple[Any, ...] = (
+    None,
+    "x",
+    -1,
+    3.5,
+    True,
+    [],
+    {},
+    [None],
+    ["x"],
+    [{"rssi": "x", "snr": {}}],
+    {"value": "x"},
+    10**400,
+    "\u202e",
+)
 CHIRPSTACK_METADATA = [
     *("deduplicationId", "fCnt", "fPort", "rxInfo", "txInfo", "devAddr", "adr", "dr", "confirmed", "data", "margin"),
     *("batteryLevel", "batteryLevelUnavailable", "externalPowerSource"),
@@ -237,7 +251,7 @@ THINGS_METADATA = [
 @pytest.mark.parametrize("name", CHIRPSTACK_METADATA)
 def test_metadata_of_chirpstack_never_costs_a_queue(name: str, odd: object) -> None:
     pending = reading_buffer()
-    assert take(pending, chirpstack_up(**{name: odd})) == "accepted"
+    assert take(pending, chirpstack_up(**dict[str, Any]({name: odd}))) == "accepted"
     assert [reading.queue for reading in waiting(pending)] == [17.0]
 
 
@@ -257,7 +271,7 @@ def test_the_things_stacks_other_time_counts_where_the_uplink_has_none() -> None
     assert take(pending, message) == "accepted"
 
 
-LATER = {"at": NOW + timedelta(seconds=10), "f_cnt": 2}
+LATER: dict[str, Any] = {"at": NOW + timedelta(seconds=10), "f_cnt": 2}
 
 
 @pytest.mark.parametrize(

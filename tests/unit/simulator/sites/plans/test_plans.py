@@ -148,10 +148,10 @@ def test_the_items_of_any_trajectory_make_its_path(places: list[Point], ring: bo
 BROKEN: list[tuple[Any, str]] = [
     ([], 'no plan of QGroundControl: its top level needs "fileType": "Plan"'),
     (plan(*TRIANGLE, fileType="Mission"), 'needs "fileType": "Plan"'),
-    (plan(*TRIANGLE, mission={}), "mission.items: field required"),
-    (plan(*TRIANGLE, mission={"items": [{"type": "Loop"}]}), "mission.items[0]: input tag"),
-    (plan(TRIANGLE[0] | {"params": [1, 2]}), "mission.items[0].params: list should have at least 7 items"),
-    (plan(TRIANGLE[0], TRIANGLE[1] | {"params": ["x"] * 7}), "mission.items[1].params[0]: input should be a valid num"),
+    (plan(*TRIANGLE, mission={}), "mission.items: is missing"),
+    (plan(*TRIANGLE, mission={"items": [{"type": "Loop"}]}), "mission.items[0]: is of an unknown type, not"),
+    (plan(TRIANGLE[0] | {"params": [1, 2]}), "mission.items[0].params: must have at least 7 items"),
+    (plan(TRIANGLE[0], TRIANGLE[1] | {"params": ["x"] * 7}), "mission.items[1].params[0]: must be a valid num"),
     (plan(*TRIANGLE[:1]), "1 waypoints; a path needs at least two that differ"),
     (plan(TRIANGLE[0], waypoint(None, None, 3)), "mission.items[1]: the waypoint has no position"),
     (plan(TRIANGLE[0], waypoint(95.0, 41.5, 3)), "mission.items[1].params: 95, 41.5 is no latitude and longitude"),
@@ -159,7 +159,7 @@ BROKEN: list[tuple[Any, str]] = [
     (plan(*TRIANGLE, item(177, 3, -1)), "mission.items[3]: it jumps to item 3; only a jump to the first waypoint"),
     (plan(*TRIANGLE, item(177, 2, 0)), "mission.items[3]: it repeats 0 times"),
     (plan(*TRIANGLE, {"type": "ComplexItem", "complexItemType": "fwLandingPattern"}), "item 'fwLandingPattern' has no"),
-    (plan(*TRIANGLE, geoFence={"polygons": [{"polygon": AROUND}]}), "geoFence.polygons[0].inclusion: field required"),
+    (plan(*TRIANGLE, geoFence={"polygons": [{"polygon": AROUND}]}), "geoFence.polygons[0].inclusion: is missing"),
     # Whatever is flown after the path's end.
     (
         plan(*TRIANGLE, item(21, number=5), item(211, 1, 0, number=6), TAKE_OFF | {"doJumpId": 7}, *TRIANGLE),
@@ -175,12 +175,12 @@ BROKEN: list[tuple[Any, str]] = [
     (plan(*TRIANGLE, geoFence={"polygon": AROUND}), "geoFence.polygon is not known; a geofence of version 2"),
     (
         plan(*TRIANGLE, geoFence={"version": 2, "circles": [{"inclusion": True, "center": [1, 2], "radius": 3}]}),
-        "geoFence.circles[0].circle: field required",
+        "geoFence.circles[0].circle: is missing",
     ),
     (plan(*TRIANGLE, geoFence=FENCED | {"corridors": []}), "geoFence.corridors is not known"),
     (
         plan(*TRIANGLE, geoFence={"circles": [{"inclusion": True, "circle": {"center": [1, 2], "radius": -3}}]}),
-        "geoFence.circles[0].circle.radius: input should be greater than 0, not -3",
+        "geoFence.circles[0].circle.radius: must be greater than 0, not -3",
     ),
     (
         plan(*TRIANGLE, geoFence={"polygons": [FENCED["polygons"][0], {"inclusion": True, "polygon": AROUND[:3]}]}),
