@@ -32,7 +32,8 @@ class RequestLimits:
     """Pure ASGI middleware: limits concurrent requests, and reads their bodies.
 
     Past ``most`` concurrent requests it answers 503 with ``Retry-After``, without reading the body. Probes, metrics and
-    the streams of pages do not count. A request counts until its answer begins, because a client may read slowly. It
+    the streams of pages do not count. A request counts until its answer begins, because a client may read slowly. If
+    bodies are still arriving, the one that began first gets a 408 instead, because a client may write slowly. It
     reads a body up to ``limit`` bytes and decodes ``Content-Encoding: gzip | zstd``. It answers 413 past the limit, 408
     for a body that takes longer than 10 s, 415 for another encoding and 400 for a damaged body. Each refusal is a
     problem document.
@@ -43,6 +44,8 @@ class RequestLimits:
         self._most = most
         self._limit = limit
         self._running = 0
+        # The time limits of the bodies that are arriving, the oldest first.
+        self._arriving: dict[asyncio.Timeout, None] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or (
@@ -51,7 +54,7 @@ class RequestLimits:
         ):
             await self.app(scope, receive, send)
             return
-        if self._running >= self._most:
+        if self._running >= self._most and not self._make_room():
             response = problem_response(503, f"{self._most} requests are in progress already")
             response.headers["Retry-After"] = "1"
             response.headers["Connection"] = "close"
@@ -82,6 +85,15 @@ class RequestLimits:
         finally:
             self._running -= counts
 
+    def _make_room(self) -> bool:
+        """End the wait for the oldest body that is arriving; returns False if there is none."""
+        for oldest in self._arriving:
+            del self._arriving[oldest]
+            if not oldest.expired():
+                oldest.reschedule(0.0)
+            return True
+        return False
+
     async def _body(self, scope: Scope, receive: Receive, send: Send) -> bytes | None:
         """The decoded body, to which the scope's headers are adapted; None if the request is already answered."""
         headers = {name.lower(): value for name, value in scope["headers"]}
@@ -92,8 +104,12 @@ class RequestLimits:
             await response(scope, receive, send)
             return None
         try:
-            async with asyncio.timeout(_BODY_S):
-                body = await self._read(receive, headers.get(b"content-length", b""))
+            async with asyncio.timeout(_BODY_S) as limit:
+                self._arriving[limit] = None
+                try:
+                    body = await self._read(receive, headers.get(b"content-length", b""))
+                finally:
+                    self._arriving.pop(limit, None)
             if body is None:
                 return None
             if encoding in _DECODERS:
@@ -110,7 +126,7 @@ class RequestLimits:
         """The problem document; the connection ends where the rest of the body may still arrive."""
         match fault:
             case TimeoutError():
-                status, problem = 408, f"not received within {_BODY_S:g} s"
+                status, problem = 408, f"not received within {_BODY_S:g} s, or in less while {self._most} requests are in progress"
             case _Damaged():
                 status, problem = 400, str(fault)
             case _:
