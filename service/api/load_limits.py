@@ -13,9 +13,9 @@ from service.api.problem_details import problem_response
 
 # Methods without a body.
 READING = ("GET", "HEAD")
-_NEVER_REFUSED = frozenset(("/healthz", "/readyz", "/metrics"))
-# A page's stream lasts as long as the page and has a limit of its own.
-_STREAMS = re.compile(r"/missions/[^/]+/events")
+# Never refused: probes, metrics, the page's files, and its streams, which have a limit of their own. Few of them need a
+# key, so they must not take the places of other requests.
+_UNCOUNTED = re.compile(r"/(healthz|readyz|metrics|static/.*|missions/[^/]+/events)?")
 # While a body arrives, its request counts against the limit of concurrent requests.
 _BODY_S = 10.0
 
@@ -31,12 +31,12 @@ class _Damaged(Exception):
 class RequestLimits:
     """Pure ASGI middleware: limits concurrent requests, and reads their bodies.
 
-    Past ``most`` concurrent requests it answers 503 with ``Retry-After``, without reading the body. Probes, metrics and
-    the streams of pages do not count. A request counts until its answer begins, because a client may read slowly. If
-    bodies are still arriving, the one that began first gets a 408 instead, because a client may write slowly. It
-    reads a body up to ``limit`` bytes and decodes ``Content-Encoding: gzip | zstd``. It answers 413 past the limit, 408
-    for a body that takes longer than 10 s, 415 for another encoding and 400 for a damaged body. Each refusal is a
-    problem document.
+    Past ``most`` concurrent requests it answers 503 with ``Retry-After``, without reading the body. Probes, metrics,
+    the page's files and its streams do not count. A request counts until its answer begins, because a client may read
+    slowly. If bodies are still arriving, the one that began first gets a 408 instead, because a client may write
+    slowly. It reads a body up to ``limit`` bytes and decodes ``Content-Encoding: gzip | zstd``. It answers 413 past the
+    limit, 408 for a body that takes longer than 10 s, 415 for another encoding and 400 for a damaged body. Each refusal
+    is a problem document.
     """
 
     def __init__(self, app: ASGIApp, most: int, limit: int) -> None:
@@ -48,10 +48,7 @@ class RequestLimits:
         self._arriving: dict[asyncio.Timeout, None] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or (
-            scope["method"] in READING
-            and (scope["path"] in _NEVER_REFUSED or _STREAMS.fullmatch(scope["path"]) is not None)
-        ):
+        if scope["type"] != "http" or (scope["method"] in READING and _UNCOUNTED.fullmatch(scope["path"])):
             await self.app(scope, receive, send)
             return
         if self._running >= self._most and not self._make_room():
@@ -126,7 +123,8 @@ class RequestLimits:
         """The problem document; the connection ends where the rest of the body may still arrive."""
         match fault:
             case TimeoutError():
-                status, problem = 408, f"not received within {_BODY_S:g} s, or in less while {self._most} requests are in progress"
+                status = 408
+                problem = f"not received within {_BODY_S:g} s, or in less while {self._most} requests are in progress"
             case _Damaged():
                 status, problem = 400, str(fault)
             case _:

@@ -4,6 +4,7 @@ import asyncio
 import logging
 import math
 import resource
+import socket
 import time
 from typing import Any
 
@@ -24,6 +25,9 @@ _MOST_S = 30.0
 # The least bytes of an answer that a client has to read in this time: 0.5 KB a second, less than a timely decision
 # needs. A page's stream has its own, shorter limit.
 _TAKEN_BYTES, _TAKEN_S = 16 * 1024, 30.0
+# The system's buffer for the answers of one connection, bytes; by itself it takes megabytes for a client that does not
+# read.
+_UNSENT_BYTES = 128 * 1024
 # Pipelined requests that wait in one connection. One read of the socket could bring 14,000.
 _MOST_WAITING = 16
 _PROBLEM = Problem(
@@ -85,6 +89,7 @@ class BoundedHttpProtocol(HttpToolsProtocol):
             return
         # Writing is paused while any byte is unsent.
         transport.set_write_buffer_limits(high=0)
+        transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNSENT_BYTES)
         self._timer = self.loop.call_later(_MOST_S, transport.close)
 
     def connection_lost(self, exc: Exception | None) -> None:

@@ -22,10 +22,8 @@ def tables(request: pytest.FixtureRequest) -> Iterator[Tables]:
     yield kept
     session = request.session
     ran = {Path(item.path).name for item in session.items}
-    whole = (
-        ran >= {"test_kills.py", "test_owners.py", "test_ray.py", "test_sigterm.py", "test_upstreams.py"}
-        and not session.config.option.keyword
-    )
+    suites = ("hostile_clients", "kills", "owners", "ray", "sigterm", "upstreams")
+    whole = ran >= {f"test_{suite}.py" for suite in suites} and not session.config.option.keyword
     text = kept.page()
     if whole and not session.testsfailed:
         PAGE.write_text(text)

@@ -82,6 +82,8 @@ class App:
             match scope["path"]:
                 case "/large":
                     await PlainTextResponse(bytes(LARGE))(scope, receive, send)
+                case "/megabyte":
+                    await PlainTextResponse(bytes(1_000_000))(scope, receive, send)
                 case "/file":
                     await FileResponse(self._file)(scope, receive, send)
                 case "/endless":
@@ -146,6 +148,13 @@ def test_who_does_not_read_is_hung_up(
     assert [line for line in lines if not line.startswith("Invalid")] == [
         "clients do not take their answers: their connections are closed"
     ]
+
+
+def test_the_system_keeps_no_megabyte_for_who_does_not_read(tmp_path: Path, connections: Connections) -> None:
+    with serving(App(tmp_path)) as url, closing(connected(url, get("/megabyte", "connection: close"))) as client:
+        until(lambda: connections.stuck)
+        answer = b"".join(iter(lambda: client.recv(65536), b""))
+    assert len(answer.partition(b"\r\n\r\n")[2]) == 1_000_000
 
 
 def test_who_reads_a_byte_at_a_time_is_hung_up(
