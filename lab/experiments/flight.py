@@ -101,12 +101,15 @@ def flight_key(scheme: Scheme, identity: str | None, site: Site, seed: int) -> s
         # So the keys of flights without one are those of versions that had none.
         if decides.get(newer) is None:
             decides.pop(newer, None)
+    scenario = site.scenario.model_dump(mode="json")
+    if scenario["initial_queue_max"] == 1:
+        del scenario["initial_queue_max"]
     if identity is not None:
         decides["identity"] = identity
     whole = {
         "format": FORMAT,
         "decides": decides,
-        "scenario": site.scenario.model_dump(mode="json"),
+        "scenario": scenario,
         "arrivals": arrivals,
         "seed": seed,
     }

@@ -144,7 +144,7 @@ def _reach_columns(scenario: Scenario) -> list[int]:
 def _expected_queue(scenario: Scenario, observation: Mapping[str, Any], age: IntArray, heard: BoolArray) -> FloatArray:
     """The expected queues, as shares of W."""
     capacity = scenario.queue_capacity
-    mean_initial = (scenario.initial_queue_min + 1.0) / 2.0 * capacity
+    mean_initial = (scenario.initial_queue_min + scenario.initial_queue_max) / 2.0 * capacity
     last = np.where(heard, observation["queue"], mean_initial)
     # Of a sensor never heard, last_heard is -1, so its age is one more than the steps flown.
     steps = np.where(heard, age, age - 1)

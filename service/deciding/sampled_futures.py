@@ -29,7 +29,8 @@ class SampledFutures:
         random = np.random.default_rng(state.seed)
         capacity = float(scenario.queue_capacity)
         rates = random.gamma(state.arrived, 1.0 / state.watched, shape)
-        drawn = random.uniform(scenario.initial_queue_min * capacity, capacity, shape)
+        fewest, most = scenario.initial_queue_min * capacity, scenario.initial_queue_max * capacity
+        drawn = random.uniform(fewest, most, shape)
         start = np.where(state.unknown, drawn, state.queue) + random.poisson(rates * state.age)
         expected = rates
         if state.dispersion > 1.0:

@@ -105,11 +105,12 @@ class FleetBelief:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        count, capacity, fewest = scenario.sensors, scenario.queue_capacity, scenario.initial_queue_min
+        count, capacity = scenario.sensors, scenario.queue_capacity
+        fewest, most = scenario.initial_queue_min, scenario.initial_queue_max
         self._scenario = scenario
         self._paths = trajectories(scenario)
-        self._drawn_variance = ((1 - fewest) * capacity) ** 2 / 12
-        self.base: FloatArray = np.full(count, (1 + fewest) / 2 * capacity)
+        self._drawn_variance = ((most - fewest) * capacity) ** 2 / 12
+        self.base: FloatArray = np.full(count, (most + fewest) / 2 * capacity)
         self.since: IntArray = np.zeros(count, dtype=np.int64)
         self.heard: IntArray = np.full(count, -1)
         self.battery: FloatArray = np.full(count, scenario.battery_j)

@@ -74,6 +74,7 @@ class Scenario(Unmodelled):
 
     queue_capacity: int = Field(60, ge=1, le=100_000, description="packets, W")
     initial_queue_min: float = Field(0.3, ge=0, le=1, description="fraction of W")
+    initial_queue_max: float = Field(1.0, ge=0, le=1, description="fraction of W")
     arrival_rate_min: float = Field(2.0, ge=0, le=1000, description="packets a step")
     arrival_rate_max: float = Field(8.0, ge=0, le=1000, description="packets a step")
     battery_j: float = Field(50.0, ge=1e-6, le=1e9)
@@ -107,6 +108,8 @@ class Scenario(Unmodelled):
     def _consistent(self) -> Self:
         if self.arrival_rate_min > self.arrival_rate_max:
             raise ValueError("arrival_rate_min exceeds arrival_rate_max")
+        if self.initial_queue_min > self.initial_queue_max:
+            raise ValueError("initial_queue_min exceeds initial_queue_max")
         if self.layout == "pipeline" and not self.pipeline:
             raise ValueError("layout pipeline needs a pipeline of at least two points")
         if self.layout == "surveyed" and len(self.sites) != self.sensors:

@@ -68,7 +68,8 @@ class Sensors:
         positions = draw_positions(scenario, streams.layout)
         rates = streams.rates.uniform(scenario.arrival_rate_min, scenario.arrival_rate_max, count)
         fewest = math.ceil(scenario.initial_queue_min * capacity - 1e-9)
-        queue = streams.queues.integers(fewest, capacity, count, endpoint=True)
+        most = max(fewest, math.floor(scenario.initial_queue_max * capacity + 1e-9))
+        queue = streams.queues.integers(fewest, most, count, endpoint=True)
         drawn = trace
         if drawn is None:
             bursts = 1.0 if scenario.burst_factor == 1 else draw_bursts(scenario, streams.bursts)
