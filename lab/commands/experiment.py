@@ -23,7 +23,7 @@ from simulator.commands.running import command_main
 from simulator.errors import UsageError
 
 SEEDS, LLM_SEEDS = 30, 10
-PAGE = "page"
+PAGE, MAP = "page", "claims-map"
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,8 @@ class ExperimentOptions:
     Without an LLM, a minute:  python -m lab experiment fairness --llm none
 
     All results beside the paper's numbers, as a page:  python -m lab experiment {PAGE} --help
+
+    Where the paper's claims hold, a map over its open numbers:  python -m lab experiment {MAP} --help
 
     Exit code: 0 made, 1 an edge or its LLM failed, 2 bad use, 130 interrupted.
     """
@@ -85,6 +87,10 @@ def main(argv: list[str]) -> int:
         from lab.experiments import page
 
         return page.main(argv[1:])
+    if argv[:1] == [MAP]:
+        from lab.claims_map import command
+
+        return command.main(argv[1:])
     return command_main(
         ExperimentOptions, "python -m lab experiment", argv, lambda options, console: experiment(options, argv, console)
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from torch import nn
@@ -12,6 +12,7 @@ from lab.marl.networks import greedy
 from lab.marl.training_worlds import TrainingWorlds
 from shared.world.channel import IntArray
 from shared.world.scenario import Scenario
+from simulator.world.batch import BatchStep
 
 
 def lost_packets(scenario: Scenario, network: nn.Module, seeds: Sequence[int]) -> IntArray:
@@ -19,10 +20,19 @@ def lost_packets(scenario: Scenario, network: nn.Module, seeds: Sequence[int]) -
 
     UAV 0 decides first, and no UAV takes a sensor that an earlier one took.
     """
+    lost = np.zeros(len(seeds), dtype=np.int64)
+    for _, outcome in flown_greedily(scenario, network, seeds):
+        lost += outcome.lost_packets
+    return lost
+
+
+def flown_greedily(
+    scenario: Scenario, network: nn.Module, seeds: Sequence[int]
+) -> Iterator[tuple[IntArray, BatchStep]]:
+    """Each step of a greedy fleet in B worlds: the sensors chosen ``(B, I)``, and the outcome."""
     world = TrainingWorlds(scenario)
     observation = world.reset(seeds)
     rows = np.arange(len(seeds))
-    lost = np.zeros(len(seeds), dtype=np.int64)
     for _ in range(scenario.steps):
         taken = np.zeros((len(seeds), scenario.sensors), dtype=np.bool_)
         actions = np.zeros((len(seeds), scenario.uavs, 2), dtype=np.int64)
@@ -32,5 +42,4 @@ def lost_packets(scenario: Scenario, network: nn.Module, seeds: Sequence[int]) -
             actions[:, uav] = np.stack((own.order[rows, slot], velocity), axis=-1)
             taken[rows, actions[:, uav, 0]] = True
         observation, outcome = world.step(actions[..., 0], actions[..., 1])
-        lost += outcome.lost_packets
-    return lost
+        yield actions[..., 0], outcome
