@@ -11,6 +11,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from simulator.commands.options import check_between
 from simulator.commands.running import command_main
+from simulator.errors import UsageError
 from simulator.records.run_folder import naming_out
 
 SEEDS, QUICK_SEEDS = 30, 2
@@ -24,7 +25,7 @@ class MapOptions:
     step of look-ahead in the LLM's place behind attention (k of 3, 5, 7 and all sensors; from the shipped and from a
     random start). One process takes an hour or two. Each scheme's flights at a setting are a file of --out, and the
     same command continues after Ctrl-C or a crash. Written to --out: claims-map.csv (a line a setting and claim),
-    curves.csv (a line a setting, scheme and step), and the figure.
+    claims-map-curves.csv (a line a setting and scheme), and the figure.
 
     Try it:  python -m lab experiment claims-map --quick
 
@@ -35,6 +36,8 @@ class MapOptions:
     """Folder to write to, made if missing; its stored flights are used again."""
     quick: Annotated[bool, FlagCreatePairsOff] = False
     """Four settings and two worlds, in under a minute: a check that the map can be made, without a valid result."""
+    written: Annotated[bool, FlagCreatePairsOff] = False
+    """Fly nothing: judge and write the settings that are complete."""
     seeds: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Worlds of each setting: seeds 0 to N - 1. Default: 30, quick 2."""
 
@@ -53,10 +56,23 @@ def claims_map(options: MapOptions, console: Console) -> int:
     seeds = options.seeds if options.seeds is not None else QUICK_SEEDS if options.quick else SEEDS
     check_between("--seeds", seeds, 2, 1000)
     # Torch and numba take seconds to import; `--help` and usage errors do without them.
-    from lab.claims_map.flights import fly_all
+    from lab.claims_map.flights import SCHEMES, Flown, fly_all, kept_at
+    from lab.claims_map.judging import judge
     from lab.claims_map.points import points
+    from lab.claims_map.writing import CURVES, FIGURE, VERDICTS, draw, write_curves, write_verdicts
 
+    kept, wanted, complete = options.out / "flights", points(options.quick), []
     with naming_out(options.out):
-        for _ in fly_all(points(options.quick), seeds, options.out / "flights", console):
-            pass
+        if options.written:
+            complete = [p for p in wanted if all(kept_at(kept, p, scheme, seeds).exists() for scheme in SCHEMES)]
+        else:
+            complete = list(fly_all(wanted, seeds, kept, console))
+        if not complete:
+            raise UsageError(f"--written: {kept} has no setting with every scheme's flights in {seeds} worlds")
+        flights = [{s: Flown.load(kept_at(kept, point, s, seeds)) for s in SCHEMES} for point in complete]
+        judged = [(point, judge(flown)) for point, flown in zip(complete, flights, strict=True)]
+        write_verdicts(options.out / VERDICTS, judged, seeds)
+        write_curves(options.out / CURVES, complete, flights)
+        draw(options.out, judged, seeds)
+    console.print(f"Wrote {VERDICTS}, {CURVES} and {FIGURE}.svg in {options.out}", markup=False, highlight=False)
     return 0

@@ -63,7 +63,7 @@ LOOKS: dict[str, Style] = {
 }
 BOUND = LOOKS["bound"]
 
-_PRINT: dict[Any, Any] = {
+PRINT: dict[Any, Any] = {
     **RC,
     "font.size": 8,
     "axes.labelsize": 8,
@@ -105,7 +105,7 @@ def draw(result: Result, out: Path, formats: Sequence[Format] = FORMATS) -> list
     drawn: list[Path] = []
     for figure in result.figures:
         # A constant salt makes the IDs, and so the whole text, the same on every run.
-        with matplotlib.style.context(["default", {**_PRINT, "svg.hashsalt": f"{result.experiment}-{figure.name}"}]):
+        with matplotlib.style.context(["default", {**PRINT, "svg.hashsalt": f"{result.experiment}-{figure.name}"}]):
             picture = _DRAWN_BY[figure.kind](result, figure)
             if picture is None:
                 continue
@@ -114,11 +114,11 @@ def draw(result: Result, out: Path, formats: Sequence[Format] = FORMATS) -> list
                 picture.savefig(path, format=kind, metadata=_UNDATED[kind])
                 drawn.append(path)
                 if kind == "svg":
-                    path.write_text(_rounded(path.read_text(encoding="utf-8")), encoding="utf-8")
+                    path.write_text(rounded(path.read_text(encoding="utf-8")), encoding="utf-8")
     return drawn
 
 
-def _rounded(svg: str) -> str:
+def rounded(svg: str) -> str:
     """The SVG with coordinates rounded to a hundredth of a point, a third smaller without a visible difference."""
 
     def shorter(attribute: re.Match[str]) -> str:

@@ -65,9 +65,11 @@ def test_only_layout_pipeline_needs_a_pipeline() -> None:
         Scenario(layout="pipeline", pipeline=())
 
 
-def test_rates_that_contradict_each_other() -> None:
+def test_ranges_that_contradict_themselves() -> None:
     with pytest.raises(ValidationError, match="arrival_rate_min exceeds arrival_rate_max"):
         Scenario(arrival_rate_min=9.0)
+    with pytest.raises(ValidationError, match="initial_queue_min exceeds initial_queue_max"):
+        Scenario(initial_queue_max=0.2)
 
 
 def test_a_scenario_cannot_be_changed() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shared.belief.fleet_belief import FleetBelief
 from shared.world.channel import channel_gain_db
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.world.environment import PipelineWorld
@@ -236,6 +237,15 @@ def test_draws_are_within_the_scenarios_bounds() -> None:
     assert np.all((sensors.rates >= 2) & (sensors.rates <= 8))
     assert [sensors.initial_queue.min(), sensors.initial_queue.max()] == [18, 60]
     np.testing.assert_allclose(sensors.arrivals.mean(axis=0), sensors.rates, atol=5 * np.sqrt(8 / 30))
+
+
+def test_initial_queues_are_bounded_from_above() -> None:
+    world = PipelineWorld(Scenario(sensors=400, initial_queue_min=0.1, initial_queue_max=0.25))
+    world.reset(seed=0)
+    assert [world.sensors.initial_queue.min(), world.sensors.initial_queue.max()] == [6, 15]
+    belief = FleetBelief(world.scenario)
+    assert belief.base.mean() == pytest.approx(10.5)
+    assert belief.base_variance.mean() == pytest.approx(9**2 / 12)
 
 
 def test_pipeline_sensors_are_strung_along_the_line() -> None:

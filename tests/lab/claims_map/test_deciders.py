@@ -1,0 +1,48 @@
+"""A mission in this process decides as the same mission over an edge, and look-ahead names only sensors kept."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lab.benchmarks import served_only
+from lab.benchmarks.trust import edge
+from lab.claims_map import flights
+from lab.claims_map.deciders import EdgeDecider, EdgeFleet, look_ahead_among
+from service.deciding.attended_state import AttendedState
+from shared.world.scenario import SCENARIOS
+from simulator.world.environment import PipelineWorld
+from simulator.world.observation_report import decide_request
+
+SHORT = SCENARIOS["paper"].model_copy(update={"steps": 12, "initial_queue_min": 0.9})
+SPECS: list[dict[str, Any]] = [{}, {"features": "paper", "belief": "reported", "init": "random"}]
+
+
+@pytest.mark.parametrize("spec", SPECS)
+def test_mode_value_loses_what_it_loses_over_an_edge(spec: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(flights.AT_THE_EDGE, "here", EdgeDecider("value", spec))
+    here = flights.fly("here", SHORT, range(2)).lost.sum(axis=1).tolist()
+    with edge() as (url, _):
+        there = [served_only.flown(url, SHORT, seed, f"there-{seed}", {"mode": "value", **spec}) for seed in range(2)]
+    assert here == there
+    assert sum(here) > 0
+
+
+def test_look_ahead_chooses_among_the_sensors_that_attention_keeps() -> None:
+    fleet = EdgeFleet(EdgeDecider("look_ahead", {"top_k": 1, "init": "random"}), SHORT, 0)
+    observations, _ = PipelineWorld(SHORT).reset(seed=0)
+    request = decide_request(0, observations["uav_0"], fleet.mission.mission_id)
+    fleet.mission.observe(request, 0)
+    state = AttendedState.of(fleet.mission, request, 0)
+    sensor, velocity = look_ahead_among(state)
+    assert [sensor] == state.kept_ids
+    assert velocity == int(np.argmax(state.reach.worth[:, state.rows[0]]))
+
+
+def test_a_sensor_that_another_uav_has_is_not_chosen() -> None:
+    fleet = EdgeFleet(flights.AT_THE_EDGE[flights.EVERY_SENSOR], SHORT, 0)
+    observations, _ = PipelineWorld(SHORT).reset(seed=3)
+    chosen = [fleet.decide(uav, observations[f"uav_{uav}"]).sensor_id for uav in range(3)]
+    assert len(set(chosen)) == 3
