@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from shared.world.scenario import SCENARIOS, Scenario
@@ -56,13 +57,14 @@ ROWS = (*map(fill_row, FILLS), *VARIANTS)
 
 
 def points(quick: bool = False) -> list[Point]:
-    """The 52 settings, those of `paper`'s step, threshold and link share first; for a quick look four of them."""
-    fills, rates = (FILLS[:2], (0.25, 5.0)) if quick else (FILLS, RATES)
-    found = [Point(fill_row(fill), rate, _world(rate, fill)) for fill in fills for rate in rates]
-    if not quick:
-        found += [
-            Point(row, rate, _world(rate, FILLS[0], **fields))
-            for row, fields in VARIANTS.items()
-            for rate in VARIED_RATES
-        ]
-    return found
+    """The 52 settings, the fuller initial queues and the variants first; for a quick look four of them."""
+
+    def by_rate(fills: Sequence[tuple[float, float]], rates: Sequence[float] = RATES) -> list[Point]:
+        return [Point(fill_row(fill), rate, _world(rate, fill)) for fill in fills for rate in rates]
+
+    if quick:
+        return by_rate(FILLS[:2], (0.25, 5.0))
+    varied = [
+        Point(row, rate, _world(rate, FILLS[0], **fields)) for row, fields in VARIANTS.items() for rate in VARIED_RATES
+    ]
+    return [*by_rate(FILLS[:2]), *varied, *by_rate(FILLS[2:])]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import matplotlib.style
@@ -84,17 +85,16 @@ def draw(folder: Path, judged: Judged, seeds: int) -> None:
 
 def _keys() -> list[Patch]:
     look_ahead = "look-ahead in the LLM's place, from a random (r) or the shipped (s) start; v: mode value"
-    looks = {
-        "holds for all that it was judged for": {"facecolor": _SHADES(1.0)},
-        look_ahead: {"facecolor": "none", "edgecolor": "none"},
-        "holds for those whose letters are given": {"facecolor": _SHADES(0.5)},
-        "moot: hardly a packet is lost": {"facecolor": _MOOT},
-        "fails": {"facecolor": "#ffffff"},
-        "the setting of scenario paper": {"facecolor": "#ffffff", "edgecolor": _FRAME},
+    looks: dict[str, tuple[Any, str]] = {
+        "holds for all that it was judged for": (_SHADES(1.0), "#888888"),
+        look_ahead: ("none", "none"),
+        "holds for those whose letters are given": (_SHADES(0.5), "#888888"),
+        "moot: hardly a packet is lost": (_MOOT, "#888888"),
+        "fails": ("#ffffff", "#888888"),
+        "the setting of scenario paper": ("#ffffff", _FRAME),
     }
-    order = (0, 2, 4, 1, 3, 5)
-    labels = [list(looks)[i] for i in order]
-    return [Patch(**{"edgecolor": "#888888", **looks[label]}, label=label) for label in labels]
+    labels = [list(looks)[i] for i in (0, 2, 4, 1, 3, 5)]
+    return [Patch(facecolor=looks[label][0], edgecolor=looks[label][1], label=label) for label in labels]
 
 
 def _grid(judged: Judged) -> tuple[list[str], list[float]]:

@@ -12,6 +12,7 @@ from lab.claims_map import points
 from lab.claims_map.command import MapOptions, claims_map
 from lab.claims_map.flights import SCHEMES
 from lab.claims_map.judging import CLAIMS
+from shared.world.scenario import SCENARIOS
 from simulator.errors import UsageError
 from tests.support.processes import run_lab_here
 
@@ -63,7 +64,7 @@ def test_the_settings_vary_what_the_paper_leaves_open() -> None:
     assert len(found) == len({point.name for point in found}) == 52
     assert {point.row for point in found} == set(points.ROWS)
     paper = next(p for p in found if (p.row, p.rate) == ("queues 0.3 to 1 W", 5.0))
-    assert paper.scenario == points.SCENARIOS["paper"]
+    assert paper.scenario == SCENARIOS["paper"]
 
 
 def test_bad_use_is_refused() -> None:
