@@ -33,8 +33,9 @@ _EXTRA = "Install the extra: pip install -e '.[lab]'"
 class Train:
     """Train a learned baseline: MADQN or MAPPO.
 
-    MADQN: independent deep Q-learning, 1000 episodes. MAPPO: actors with a centralised critic, 21600 episodes. Both
-    with the paper's table of hyperparameters, on TorchRL; about ten minutes each. Written to --out: SCHEME.pt (the
+    MADQN: independent deep Q-learning with one network for all UAVs, 1000 episodes. MAPPO: actors with a centralised
+    critic, 21600 episodes. `madqn_paper`: the paper's MADQN, a network for each UAV on its plain state, 1000 episodes.
+    All with the paper's table of hyperparameters; about ten minutes each. Written to --out: SCHEME.pt (the
     weights for `--policy`), SCHEME.csv and .png and .svg (the learning curve), tensorboard/, state.pt.
 
     The checkpoints that ship with the package were made by
@@ -43,6 +44,8 @@ class Train:
 
       python -m lab train mappo --out runs/mappo
 
+      python -m lab train madqn_paper --out runs/madqn_paper
+
     Watch a training with `tensorboard --logdir runs`. After Ctrl-C or a crash, the same command with --resume continues
     the training, and its weights equal those of an uninterrupted one. The same options give the same weights to the bit
     on the same machine. Training worlds are apart from every evaluation seed.
@@ -50,12 +53,12 @@ class Train:
     Exit code: 0 trained, 2 bad use, 130 interrupted.
     """
 
-    scheme: Positional[Literal["madqn", "mappo"]]
+    scheme: Positional[Literal["madqn", "mappo", "madqn_paper"]]
     """The scheme to train."""
     scenario: Annotated[str, arg(metavar="NAME")] = "paper"
     """The training's world. Weights fit only scenarios with the same numbers of sensors, UAVs and velocities."""
     episodes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Missions to fly. Default: 1000 for madqn, as in the paper, 21600 for mappo."""
+    """Missions to fly. Default: 1000 for either madqn, as in the paper, 21600 for mappo."""
     seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of the initial weights, the exploration and the training worlds, 0 to 4294967295."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
@@ -117,12 +120,15 @@ def check(options: Train) -> None:
 
 def _planned(options: Train, scenario: Scenario) -> tuple[Callable[[Scenario, int, int], MarlScheme], TrainingPlan]:
     try:
-        from lab.marl import madqn, mappo
+        from lab.marl import madqn, mappo, paper_madqn
     except ModuleNotFoundError as missing:
         raise UsageError(f"{missing.name} is not installed. {_EXTRA}") from None
 
-    learner: Callable[[Scenario, int, int], MarlScheme] = madqn.Madqn if options.scheme == "madqn" else mappo.Mappo
-    episodes = madqn.EPISODES if options.scheme == "madqn" else mappo.EPISODES
+    learners: dict[str, Callable[[Scenario, int, int], MarlScheme]] = {
+        learner.name: learner for learner in (madqn.Madqn, mappo.Mappo, paper_madqn.PaperMadqn)
+    }
+    learner = learners[options.scheme]
+    episodes = mappo.EPISODES if options.scheme == "mappo" else madqn.EPISODES
     chosen = episodes if options.episodes is None else options.episodes
     return learner, TrainingPlan(options.scheme, scenario, chosen, options.seed, options.threads)
 

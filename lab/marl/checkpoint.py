@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lab.marl.networks import two_heads
+from lab.marl.networks import network_of
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
 
@@ -22,7 +22,7 @@ class CheckpointMismatch(UsageError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class PolicyCheckpoint:
-    """Weights of :func:`lab.marl.networks.two_heads` in float32, and their origin.
+    """Weights of :func:`lab.marl.networks.network_of` in float32, and their origin.
 
     Attributes:
         scenario: of the training.
@@ -71,7 +71,7 @@ class PolicyCheckpoint:
                     f"{self.scheme} was trained for {name} {trained}, scenario {scenario.name} has {requested}: "
                     f"train one with `python -m lab train {self.scheme} --scenario {scenario.name}`"
                 )
-        network = two_heads(scenario)
+        network = network_of(self.scheme, scenario)
         network.load_state_dict(self.weights)
         return network.eval()
 

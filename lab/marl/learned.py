@@ -17,10 +17,11 @@ class Learned:
     """The greedy policy of a network trained by `python -m lab train`; it draws no random number.
 
     Its input is :func:`lab.marl.network_inputs.actor_input` of the UAV's observation. It chooses among the free
-    sensors heard at least once, or among all free sensors if there is none.
+    sensors heard at least once, or among all free sensors if there is none. ``madqn_paper`` has each UAV's plain state,
+    and chooses among all sensors.
 
     Args:
-        scheme: ``madqn`` or ``mappo``.
+        scheme: ``madqn``, ``mappo`` or ``madqn_paper``.
         checkpoint: weights of that scheme; by default those that ship with the package.
 
     Raises:
@@ -42,13 +43,12 @@ class Learned:
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
         """Sensor and velocity."""
-        from lab.marl.network_inputs import actor_input, mask_without, taken_mask
-        from lab.marl.networks import greedy
+        from lab.marl.evaluate import chosen
+        from lab.marl.network_inputs import taken_mask
 
-        own = actor_input(self._scenario, uav, observation)
-        mask = mask_without(own, taken_mask(taken, self._scenario.sensors))
-        slot, velocity = greedy(self._network, self._scenario.sensors, own.features, mask).tolist()
-        return int(own.order[slot]), velocity
+        known = taken_mask(taken, self._scenario.sensors)
+        sensor, velocity = chosen(self._scenario, self._network, uav, observation, known).tolist()
+        return int(sensor), int(velocity)
 
 
 def madqn() -> Learned:
