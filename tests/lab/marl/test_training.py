@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lab.marl import checkpoint, madqn, mappo
+from lab.marl import checkpoint, madqn, mappo, paper_madqn
 from lab.marl.curve import Point, plot, read_csv, write_csv
 from lab.marl.plan import STATE, TrainingPlan
 from lab.marl.training import _HELD_OUT, MarlScheme, Round, Training
@@ -22,15 +22,20 @@ from simulator.errors import UsageError
 pytestmark = pytest.mark.long
 
 SMALL = Scenario(name="small", sensors=4, uavs=2, steps=6)
-MAKE: dict[str, Callable[[Scenario, int, int], MarlScheme]] = {"madqn": madqn.Madqn, "mappo": mappo.Mappo}
+MAKE: dict[str, Callable[[Scenario, int, int], MarlScheme]] = {
+    "madqn": madqn.Madqn,
+    "mappo": mappo.Mappo,
+    "madqn_paper": paper_madqn.PaperMadqn,
+}
 ROUNDS = 6
-WORLDS = {"madqn": madqn.WORLDS, "mappo": mappo.WORLDS}
+WORLDS = {"madqn": madqn.WORLDS, "mappo": mappo.WORLDS, "madqn_paper": madqn.WORLDS}
 
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """A plan with few missions, and learning from the start."""
     monkeypatch.setattr(madqn, "WARM_UP", 150)
+    monkeypatch.setattr(paper_madqn, "WARM_UP", 150)
 
 
 def plan_of(scheme: str, seed: int = 0, rounds: int = ROUNDS) -> TrainingPlan:
@@ -55,7 +60,7 @@ def same(one: dict[str, Tensor], other: dict[str, Tensor]) -> bool:
     return all(torch.equal(one[name], other[name]) for name in one)
 
 
-@pytest.mark.parametrize("scheme", ["madqn", "mappo"])
+@pytest.mark.parametrize("scheme", list(MAKE))
 def test_resumed_after_an_interrupt_it_ends_with_the_same_weights_and_curve(scheme: str, tmp_path: Path) -> None:
     plan = plan_of(scheme)
     whole = begun(plan, tmp_path / "whole")
