@@ -83,6 +83,8 @@ class Fly:
     """The link to the ground sensors, which MAVLink does not have. simulated: sensors made up as `aicvds simulate`
     does, for trials. MODULE:NAME: your own, a callable that takes the site and returns a Radio
     (field/vehicles/radio.py; docs/guides/uav.md has an example)."""
+    system_id: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """The MAVLink system ID of this program, 1 to 255. Default: each vehicle's own, as a computer on board has it."""
     seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of the simulated sensors, 0 to 4294967295."""
     mode: Annotated[Mode | None, arg(metavar="guided|llm|value|policy", help_behavior_hint="")] = None
@@ -166,6 +168,7 @@ def job_from_options(options: Fly) -> FieldJob:
         patience_s=patience_s,
         speedup=options.speedup,
         wait_s=options.wait_s,
+        system_id=options.system_id,
     )
 
 
@@ -184,7 +187,22 @@ def check(options: Fly) -> str:
     check_wait(options.wait_s)
     check_deadline(options.deadline_ms)
     check_between("--speedup", options.speedup, 0.1, 100.0)
+    if options.system_id is not None:
+        check_between("--system-id", options.system_id, 1, 255)
+    places = [listened_at(url) for url in options.mavlink]
+    for place, url in zip(places, options.mavlink, strict=True):
+        if places.count(place) > 1:
+            raise UsageError(
+                f"--mavlink {url}: two connections to one place ({place}) would hear the same vehicle twice; let each "
+                "vehicle send to a port of its own, such as 14540 and 14541"
+            )
     return options.mission
+
+
+def listened_at(url: str) -> str:
+    """The port or device of a connection: two that listen on one UDP port hear the same vehicles, whatever the host."""
+    scheme, _, place = url.partition("://")
+    return f"UDP port {place.rpartition(':')[2]}" if scheme in ("udp", "udpin") else url
 
 
 def checked_site(options: Fly) -> Site:
@@ -220,10 +238,12 @@ def conclude(flown: RealFlight, job: FieldJob, command: str, console: Console) -
     ).model_copy(update={"seed": job.seed, "uavs": len(job.mavlink)})
     tallies = {"aic_vds": flown.tally}
     real = RealUavs(
-        uavs=sums_by_uav(flown.decisions),
+        uavs=sums_by_uav(flown.decisions, flown.metres),
         late=flown.late,
         undecided=dict(flown.undecided.most_common()),
         not_carried_out=flown.not_carried_out,
+        ended=flown.ended,
+        warnings=flown.warnings,
         simulated_lost=job.radio.lost if isinstance(job.radio, SimulatedRadio) else None,
     )
     summary = summarise(facts, flown.decisions, tallies).model_copy(update={"real_uavs": real})

@@ -1,13 +1,14 @@
 """The flight of real UAVs: telemetry in, decisions out as speeds along their missions' paths, outcomes back.
 
 All UAVs of a flight are at the same waypoint: every ``step_s`` seconds of the mission each reports, decides, and gets
-the speed that brings it to its next waypoint in time. There it collects from the decided sensor.
+the speed that brings it to its next waypoint in time, which is corrected on the way. There it collects from the decided
+sensor.
 """
 
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -35,21 +36,32 @@ class RealFlight(Flight):
         late: decisions that came after their step.
         undecided: waypoints at which a UAV got no command, by the reason.
         not_carried_out: texts of the commands that a vehicle did not carry out.
+        ended: by UAV, why it did not fly its mission at the end.
+        metres: by UAV, the ways decided and flown, of the decisions at whose start and end its position was known.
+        warnings: texts on missions that may not be flown as the world says.
     """
 
     mode: Mode | None = None
     late: int = 0
     undecided: Counter[str] = field(default_factory=Counter)
     not_carried_out: list[str] = field(default_factory=list)
+    ended: dict[int, str] = field(default_factory=dict)
+    metres: dict[int, tuple[float, float]] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class _Leg:
-    """A decision that is being flown."""
+    """A decision that is being flown, from a way flown of ``start_m``."""
 
     uav: FieldUav
     choice: PilotChoice
     spot: Spot
+    start_m: float
+
+
+# Parts of a step in which the speed is corrected; in the last one a new speed would take effect too late.
+_PARTS = 5
 
 
 class FieldFlight:
@@ -81,6 +93,8 @@ class FieldFlight:
         self._on_decision, self._on_event = on_decision, on_event
         self._unavailable_reasons: dict[int, str | None] = {}
         self._counters = LossCounters()
+        # When the newest telemetry was read.
+        self._read_s = self._clock.now()
 
     async def fly(self) -> RealFlight:
         """Fly the steps, or until every UAV has landed. A cancelled flight ends like a flown one, and then raises."""
@@ -88,15 +102,16 @@ class FieldFlight:
         took_off = time.monotonic()
         step_s, began = self._scenario.step_s, self._clock.now()
         try:
-            await self._update_uavs(step_s)
+            await self._update_uavs()
             for step in range(self._scenario.steps):
                 if step == 0:
                     await self._listen(0)
                 legs = await self._decide(step, began + step * step_s)
                 if self._clock.now() > began + (step + 1) * step_s:
                     self.result.late += len(legs)
+                await self._correct(legs, began + (step + 1) * step_s)
                 await self._clock.until(began + (step + 1) * step_s)
-                await self._update_uavs(step_s)
+                await self._update_uavs()
                 await self._collect(legs, step)
                 legs = []
                 if all(uav.landed for uav in self._uavs):
@@ -104,12 +119,31 @@ class FieldFlight:
         finally:
             # If the flight is cut short, the outcomes of its last decisions stay unknown.
             await self._finish()
+            reasons = {uav.index: uav.unavailable_reason for uav in self._uavs}
+            self.result.ended = {index: reason for index, reason in reasons.items() if reason is not None}
             self.result.mode = self._pilot.mode
             self.result.duration_s = time.monotonic() - took_off
         return self.result
 
-    async def _update_uavs(self, seconds: float) -> None:
+    async def _update_uavs(self) -> None:
+        seconds = self._since_read_s()
         await asyncio.gather(*(uav.update(seconds) for uav in self._uavs))
+        for uav in self._uavs:
+            if uav.unavailable_reason != self._unavailable_reasons.get(uav.index):
+                self._on_event(uav.index, uav.unavailable_reason or "it flies its mission")
+            self._unavailable_reasons[uav.index] = uav.unavailable_reason
+
+    def _since_read_s(self) -> float:
+        before, self._read_s = self._read_s, self._clock.now()
+        return self._read_s - before
+
+    async def _correct(self, legs: Sequence[_Leg], ends_s: float) -> None:
+        """Correct the speeds until the last part of the step that ends then."""
+        part_s = self._scenario.step_s / _PARTS
+        while self._clock.now() < ends_s - 1.5 * part_s:
+            await self._clock.until(self._clock.now() + part_s)
+            seconds, left_s = self._since_read_s(), ends_s - self._read_s
+            await asyncio.gather(*(self._carry_out(leg.uav, leg.uav.correct(seconds, left_s)) for leg in legs))
 
     async def _decide(self, step: int, since_s: float) -> list[_Leg]:
         """Decide for the UAVs that fly their missions, and command them; their waypoint was at ``since_s``."""
@@ -117,20 +151,27 @@ class FieldFlight:
         for uav in self._uavs:
             if uav.unavailable_reason is not None:
                 self.result.undecided[uav.unavailable_reason] += 1
-            if uav.unavailable_reason != self._unavailable_reasons.get(uav.index):
-                self._on_event(uav.index, uav.unavailable_reason or "it flies its mission")
-            self._unavailable_reasons[uav.index] = uav.unavailable_reason
-        choices = await self._pilot.decide({index: uav.observation(step) for index, uav in flying.items()})
-        legs = [_Leg(flying[index], choice, flying[index].spot(step)) for index, choice in choices.items()]
-        await asyncio.gather(*(self._command(leg, self._clock.now() - since_s) for leg in legs))
+        choices = await self._pilot.decide(
+            {index: uav.observation(step) for index, uav in flying.items()},
+            {index: uav.top_speed_m_s for index, uav in flying.items()},
+        )
+        legs = [
+            _Leg(flying[index], choice, flying[index].spot(step), flying[index].flown_m)
+            for index, choice in choices.items()
+        ]
+        self._read_s = self._clock.now()
+        decided_s = self._read_s - since_s
+        await asyncio.gather(
+            *(self._carry_out(leg.uav, leg.uav.command(leg.choice.velocity, decided_s)) for leg in legs)
+        )
         return legs
 
-    async def _command(self, leg: _Leg, decided_s: float) -> None:
+    async def _carry_out(self, uav: FieldUav, command: Awaitable[None]) -> None:
         try:
-            await leg.uav.command(leg.choice.velocity, decided_s)
+            await command
         except VehicleError as error:
             self.result.not_carried_out.append(str(error))
-            self._on_event(leg.uav.index, str(error))
+            self._on_event(uav.index, str(error))
 
     async def _collect(self, legs: Sequence[_Leg], step: int) -> None:
         """Collect in the order of the UAVs, hear the sensors at the next waypoint, and record the outcomes."""
@@ -138,6 +179,10 @@ class FieldFlight:
         for leg in legs:
             if leg.uav.unavailable_reason in (LINK_LOST, NO_POSITION):
                 leg.uav.dead_reckon(leg.choice.velocity, self._scenario.step_s)
+            else:
+                decided_m, flown_m = self.result.metres.get(leg.uav.index, (0.0, 0.0))
+                decided_m += leg.choice.velocity * self._scenario.step_s
+                self.result.metres[leg.uav.index] = decided_m, flown_m + leg.uav.flown_m - leg.start_m
             collected[leg.uav.index] = await self._radio.collect(leg.uav.spot(step), leg.choice.sensor)
         lost, grown = await self._listen(step + 1)
         for leg in legs:

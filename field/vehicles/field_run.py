@@ -25,7 +25,7 @@ from simulator.errors import UsageError
 from simulator.records.decision import Decision
 from simulator.records.mission_logs import DecisionLog, RequestLog, with_edge_defaults
 from simulator.records.run_folder import DECISIONS, REQUESTS, fresh_folder, naming_out
-from simulator.sites.plans.mission_path import MissionItem, path_of
+from simulator.sites.plans.mission_path import DELAY, JUMP, WAYPOINT, MissionItem, path_of, repeats_forever
 from simulator.sites.site import Site
 
 
@@ -50,6 +50,7 @@ class FieldJob:
     patience_s: float
     speedup: float
     wait_s: float
+    system_id: int | None = None
 
 
 class FlightInterrupted(Exception):
@@ -74,7 +75,11 @@ async def run_field_mission(job: FieldJob) -> RealFlight:
     try:
         with cancel_on_signals():
             async with AsyncExitStack() as stack:
-                uavs = [await stack.enter_async_context(connect_uav(job, number)) for number in range(len(job.mavlink))]
+                warnings: list[str] = []
+                uavs = [
+                    await stack.enter_async_context(connect_uav(job, number, warnings))
+                    for number in range(len(job.mavlink))
+                ]
                 client = await stack.enter_async_context(edge_client(job))
                 pilot = FieldPilot(client, job.mission_id, job.site.scenario, job.patience_s, job.mode, job.deadline_ms)
                 await join_mission(pilot, job)
@@ -84,6 +89,7 @@ async def run_field_mission(job: FieldJob) -> RealFlight:
                     job.site, uavs, job.radio, pilot, MissionClock(job.speedup),
                     lambda decision: log_decision(decision, logs), lambda uav, text: print_line(f"UAV {uav}: {text}"),
                 )  # fmt: skip
+                flight.result.warnings = warnings
                 flown = await flight.fly()
                 if pilot.last_error is not None:
                     print_line(f"the edge's last failure: {pilot.last_error}")
@@ -95,11 +101,15 @@ async def run_field_mission(job: FieldJob) -> RealFlight:
 
 
 @asynccontextmanager
-async def connect_uav(job: FieldJob, number: int) -> AsyncIterator[FieldUav]:
-    """The UAV at one of the job's connections, its mission checked."""
+async def connect_uav(job: FieldJob, number: int, warnings: list[str]) -> AsyncIterator[FieldUav]:
+    """The UAV at one of the job's connections, its mission checked; what may go wrong with it is appended."""
     index = job.first_uav + number
-    async with mavlink_vehicle(job.mavlink[number], job.wait_s) as vehicle:
-        height_m = check_uploaded(await vehicle.mission(), job.site, index, vehicle.name)
+    async with mavlink_vehicle(job.mavlink[number], job.wait_s, job.system_id) as vehicle:
+        items = await vehicle.mission()
+        height_m = check_uploaded(items, job.site, index, vehicle.name)
+        for text in doubts_of(items, job.site):
+            warnings.append(f"UAV {index}: {text}")
+            print_line(f"warning: {warnings[-1]}")
         yield FieldUav(index, vehicle, job.site, height_m)
 
 
@@ -196,8 +206,34 @@ async def wait_for_missions(
         await asyncio.sleep(POLL_S)
 
 
-# MAVLink sends positions to the centimetre, and a plan may have been drawn on a map again.
-TOLERANCE_M = 2.0
+# MAVLink sends positions to the centimetre, and a plan may have been drawn on a map again. Heights change the links
+# less.
+TOLERANCE_M, HEIGHT_TOLERANCE_M = 2.0, 5.0
+
+
+def doubts_of(items: Sequence[MissionItem], site: Site) -> list[str]:
+    """What of a vehicle's mission the world does not have: other heights, times to wait, and an end."""
+    doubts, world = [], site.scenario
+    heights = [item.altitude_m for item in items if item.command == WAYPOINT]
+    known = [height for height in heights if height is not None]
+    if len(known) < len(heights):
+        doubts.append(
+            f"{len(heights) - len(known)} waypoints' heights are not above the take-off place, and cannot be compared "
+            f"with the world's {world.altitude_m:g} m"
+        )
+    elif any(abs(height - world.altitude_m) > HEIGHT_TOLERANCE_M for height in known):
+        doubts.append(
+            f"its waypoints are {min(known):g} to {max(known):g} m above the take-off place, the world's UAVs fly at "
+            f"{world.altitude_m:g} m: the edge expects other links"
+        )
+    waits_s = sum(item.parameters[0] for item in items if item.command in (WAYPOINT, DELAY) and item.parameters[0] > 0)
+    if waits_s:
+        doubts.append(f"it waits {waits_s:g} s at its waypoints, which no decision counts on")
+    jump = next((item for item in items if item.command == JUMP), None)
+    if jump is None or not repeats_forever(jump):
+        repeats = "once" if jump is None else f"{jump.parameters[1] + 1:g} times"
+        doubts.append(f"it flies its path {repeats}, and ends then, whatever number of steps is left")
+    return doubts
 
 
 def check_uploaded(items: Sequence[MissionItem], site: Site, uav: int, vehicle: str) -> float:

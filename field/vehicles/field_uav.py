@@ -8,7 +8,7 @@ import numpy as np
 from field.errors import VehicleError
 from field.vehicles.heard_beacons import HeardBeacons
 from field.vehicles.radio import Spot
-from field.vehicles.vehicle import Vehicle, VehicleState
+from field.vehicles.vehicle import FlightMode, Vehicle, VehicleState
 from shared.world.scenario import Point
 from shared.world.trajectory import Trajectory, trajectories
 from simulator.sites.site import Site
@@ -32,26 +32,42 @@ class PathFollower:
 
     Attributes:
         progress_m: arc length from the trajectory's beginning; ``None`` before the first position.
+        flown_m: the way along the trajectory since the first position.
     """
 
     def __init__(self, trajectory: Trajectory, top_speed_m_s: float) -> None:
         self._trajectory, self._top_speed_m_s = trajectory, top_speed_m_s
         self.progress_m: float | None = None
+        self.flown_m = 0.0
 
     def follow(self, position: Point, seconds: float) -> float:
         """Take a position that many seconds after the last one; returns its distance from the trajectory, metres."""
+        before, gap = self.progress_m, self._locate(position, seconds)
+        if before is not None and self.progress_m is not None:
+            # Progress may restart with every lap.
+            self.flown_m += math.remainder(self.progress_m - before, self._trajectory.length_m)
+        return gap
+
+    def _locate(self, position: Point, seconds: float) -> float:
         if self.progress_m is not None:
             first = max(0.0, self.progress_m - SLACK_M)
             last = self.progress_m + self._top_speed_m_s * seconds + SLACK_M
             count = min(_MOST_SAMPLES, int((last - first) / _SAMPLE_M) + 2)
-            along = np.linspace(first, last, count)
-            gaps = np.hypot(*(self._trajectory.at(along) - position).T)
-            nearest = int(np.argmin(gaps))
-            if gaps[nearest] <= SLACK_M:
-                self.progress_m = float(along[nearest])
-                return float(gaps[nearest])
+            at, gap = self._nearest(position, first, last, count)
+            if gap <= SLACK_M:
+                # To the centimetre: a speed is worked out from what is left of a way.
+                apart_m = (last - first) / (count - 1)
+                self.progress_m, gap = self._nearest(position, max(0.0, at - apart_m), at + apart_m, int(200 * apart_m))
+                return gap
         self.progress_m, gap = self._trajectory.locate(position)
         return gap
+
+    def _nearest(self, position: Point, first_m: float, last_m: float, count: int) -> tuple[float, float]:
+        """Of so many points between two arc lengths, the arc length of the nearest one, and its distance."""
+        along = np.linspace(first_m, last_m, max(count, 2))
+        gaps = np.hypot(*(self._trajectory.at(along) - position).T)
+        nearest = int(np.argmin(gaps))
+        return float(along[nearest]), float(gaps[nearest])
 
     def ahead(self, metres: float) -> Point:
         """The point of the trajectory that many metres ahead."""
@@ -61,15 +77,18 @@ class PathFollower:
 
 # Farther from its trajectory than this a UAV gets no command.
 OFF_PATH_M = 100.0
-# Below this height above its take-off place a UAV has not taken off, or lands.
+# Below this height above its home a UAV that does not say whether it is in the air is on the ground.
 AIRBORNE_M = 5.0
 # A UAV has begun its path at this share of its height, or so far from where it climbs, metres. On ArduPilot the
 # take-off is a part of mode AUTO already, in which it climbs without a way forward.
 _BEGUN_SHARE, _BEGUN_M = 0.9, 20.0
-LINK_LOST = "the link is lost"
+NO_TELEMETRY, LINK_LOST = "no telemetry yet", "the link is lost"
 NO_POSITION = "its heartbeat arrives, but no position, which was asked for"
-# Below this speed a UAV waits in place instead, m/s.
-LEAST_SPEED_M_S = 0.5
+_ENDS: dict[FlightMode, str] = {"landing": "it lands", "returning": "it returns to where it took off"}
+# Below this speed a UAV waits in place instead, m/s. A change below the second is not worth a command on the way.
+LEAST_SPEED_M_S, _CHANGE_M_S = 0.5, 0.2
+# A UAV that flies within half a metre a second of its fastest for so long, and is commanded more, has reached its top.
+_AT_TOP_S, _NEAR_TOP_M_S = 3.0, 0.5
 # The mode comes with the heartbeat, once a second: so long after its own command the flight still reads the old mode.
 MODE_LAG_S = 2.5
 
@@ -85,6 +104,7 @@ class FieldUav:
 
     Attributes:
         index: among the world's trajectories.
+        top_speed_m_s: the ground speed that it does not exceed however much it is commanded; ``None`` until it is seen.
         waits: whether this flight commanded it to wait in place.
         unavailable_reason: why it gets no command now; ``None`` while it flies its mission.
         landed: whether it has ended its mission for good.
@@ -92,9 +112,10 @@ class FieldUav:
 
     def __init__(self, index: int, vehicle: Vehicle, site: Site, height_m: float = AIRBORNE_M) -> None:
         self.index, self.vehicle = index, vehicle
+        self.top_speed_m_s: float | None = None
         self.waits = False
         self.landed = False
-        self.unavailable_reason: str | None = "no telemetry yet"
+        self.unavailable_reason: str | None = NO_TELEMETRY
         self._site = site
         self._follower = PathFollower(trajectories(site.scenario)[index], float(site.scenario.max_velocity))
         self._here: Point = (0.0, 0.0)
@@ -106,20 +127,27 @@ class FieldUav:
         # Since the last position that was near its trajectory.
         self._since_located_s = 0.0
         self._mode_changed_s = -math.inf
-        # The last commanded ground speed, m/s; unknown before the first command.
+        # The last commanded ground speed, m/s; unknown before the first command. The autopilot may forget it.
         self._speed: float | None = None
+        self._forgets = False
+        # Where the decision that it flies ends, as a way flown; none while it flies none.
+        self._goal_m: float | None = None
+        self._fastest_m_s, self._at_top_s = 1.0, 0.0
+        self._mode: FlightMode = "other"
         self.heard = HeardBeacons(np.array(site.scenario.sites))
 
     async def update(self, seconds: float) -> None:
         """Read the newest telemetry, that many seconds after the last."""
         self._since_located_s += seconds
         state = await self.vehicle.state()
+        self._mode = state.mode
         self.unavailable_reason = (
             self._control_fault(state) or self._position_fault(state.position) or self._climb_fault(state.height_m)
         )
         if self.unavailable_reason is None and state.mode == "mission" and not self._mode_is_old:
             # The pilot may have resumed the mission too.
-            self.waits = False
+            self.waits = self.waits and self.vehicle.waits_in_mission
+        self._watch_speed(state.speed_m_s, seconds)
 
     def spot(self, step: int) -> Spot:
         """Where it is, as far as its telemetry goes."""
@@ -128,6 +156,11 @@ class FieldUav:
     def observation(self, step: int) -> Observation:
         """The observation from the beacons that it heard."""
         return self.heard.observation(step, self._here, self._follower.progress_m or 0.0)
+
+    @property
+    def flown_m(self) -> float:
+        """The way along its trajectory since its first position, metres."""
+        return self._follower.flown_m
 
     def dead_reckon(self, velocity: int, seconds: float) -> None:
         """Assume the position along its path after these seconds; for a UAV whose telemetry has stopped."""
@@ -141,41 +174,78 @@ class FieldUav:
 
         Args:
             velocity: decided, m/s.
-            decided_s: seconds since the waypoint. Meanwhile the UAV has flown on at its last commanded speed, and the
-                commanded speed makes up for the difference. A speed below ``LEAST_SPEED_M_S`` is a wait in place.
+            decided_s: seconds since the waypoint. What the UAV has flown meanwhile counts: the commanded speed brings
+                it the rest of the way. A speed below ``LEAST_SPEED_M_S`` is a wait in place.
 
         Raises:
             VehicleError: the vehicle did not carry it out, or a pilot or failsafe took control during the decision.
         """
-        speed = self._speed_for(velocity, decided_s)
-        why = self._control_fault(await self.vehicle.state())
-        if why is not None:
-            raise VehicleError(f"{self.vehicle.name} got no command to fly at {speed:g} m/s: {why}")
+        left_s = self._site.scenario.step_s - decided_s
+        goal_m, self._goal_m = self.flown_m + velocity * self._site.scenario.step_s, None
+        await self.update(decided_s)
+        speed = float(velocity) if velocity == 0 or left_s <= 0 else self._speed_to(goal_m, left_s)
+        if self.unavailable_reason is not None:
+            raise VehicleError(f"{self.vehicle.name} got no command to fly at {speed:g} m/s: {self.unavailable_reason}")
         if speed < LEAST_SPEED_M_S:
+            # Where it cannot wait, the corrections slow it down.
+            self._goal_m = goal_m
             if not self.waits:
                 await self.vehicle.hold()
                 self.waits, self._mode_changed_s = True, time.monotonic()
             return
-        # Some autopilots forget the speed when the mode changes.
         await self.resume_mission()
+        await self._set_speed(speed)
+        self._goal_m = goal_m if left_s > 0 else None
+
+    async def correct(self, seconds: float, left_s: float) -> None:
+        """Set the speed that brings it the rest of its decided way, where the last one no longer does.
+
+        Airframes need time for a new speed, and PX4 forgets the speed as the mission goes on, after it has said so.
+
+        Args:
+            seconds: since the last telemetry that was read.
+            left_s: until the next waypoint.
+
+        Raises:
+            VehicleError: the vehicle did not carry it out.
+        """
+        await self.update(seconds)
+        if self.unavailable_reason is not None or self.waits or self._goal_m is None:
+            return
+        speed = max(LEAST_SPEED_M_S, self._speed_to(self._goal_m, left_s))
+        forgotten = self._forgets and self._mode == "mission"
+        if forgotten or abs(speed - (self._speed or 0.0)) >= _CHANGE_M_S:
+            self._forgets = self._forgets and not forgotten
+            goal_m, self._goal_m = self._goal_m, None
+            await self._set_speed(speed)
+            self._goal_m = goal_m
+
+    def _speed_to(self, goal_m: float, left_s: float) -> float:
+        """The speed that brings it to that way flown in time, rounded to cm/s."""
+        return round(min(max((goal_m - self.flown_m) / left_s, 0.0), float(self._site.scenario.max_velocity)), 2)
+
+    async def _set_speed(self, speed: float) -> None:
         await self.vehicle.set_speed(speed)
         self._speed = speed
-
-    def _speed_for(self, velocity: int, decided_s: float) -> float:
-        """``(v dt - u s) / (dt - s)`` for the last speed u and s seconds since the waypoint, rounded to cm/s."""
-        world = self._site.scenario
-        left_s = world.step_s - decided_s
-        last = 0.0 if self.waits else self._speed
-        if velocity == 0 or last is None or left_s <= 0:
-            return float(velocity)
-        speed = (velocity * world.step_s - last * decided_s) / left_s
-        return round(min(max(speed, 0.0), float(world.max_velocity)), 2)
 
     async def resume_mission(self) -> None:
         """Let it go on with its mission if this flight made it wait; raises :class:`VehicleError`."""
         if self.waits:
             await self.vehicle.resume()
-            self.waits, self._mode_changed_s = False, time.monotonic()
+            self.waits, self._mode_changed_s, self._forgets = False, time.monotonic(), True
+
+    def _watch_speed(self, speed_m_s: float | None, seconds: float) -> None:
+        """Take a ground speed; an acknowledged command is no speed, and an airframe has a fastest one."""
+        if speed_m_s is None or self._speed is None or self.waits or self.unavailable_reason is not None:
+            return
+        near = speed_m_s >= self._fastest_m_s - _NEAR_TOP_M_S
+        if speed_m_s > self._fastest_m_s + 0.1:
+            self._at_top_s = 0.0
+        elif near and self._speed > self._fastest_m_s + _NEAR_TOP_M_S:
+            self._at_top_s += seconds
+        self._fastest_m_s = max(self._fastest_m_s, speed_m_s)
+        if self._at_top_s >= _AT_TOP_S or self.top_speed_m_s is not None:
+            self.top_speed_m_s = self._fastest_m_s
 
     @property
     def _mode_is_old(self) -> bool:
@@ -187,14 +257,16 @@ class FieldUav:
             return LINK_LOST
         if state.position is None:
             return NO_POSITION
-        if not state.armed or state.mode == "landing":
+        if state.armed is None:
+            return NO_TELEMETRY
+        if not state.armed or state.mode in _ENDS:
             self.landed = True
-            return "it lands" if state.armed else "it is not armed"
+            return _ENDS[state.mode] if state.armed else "it is not armed"
         if state.mode != "mission" and not (state.mode == "hold" and (self.waits or self._mode_is_old)):
             # The pilot who flies it now decides when its mission goes on.
             self.waits = False
             return "it does not fly its mission"
-        if state.height_m < AIRBORNE_M:
+        if not (state.height_m >= AIRBORNE_M if state.in_air is None else state.in_air):
             self._begun, self._climbs_at = False, None
             return "it is on the ground"
         return None

@@ -1,16 +1,18 @@
 """A vehicle over MAVLink, by MAVSDK 4 (extra ``mavlink``).
 
-Three commands fly it: ``MAV_CMD_DO_CHANGE_SPEED``, and ``MAV_CMD_DO_SET_MODE`` with the modes hold and mission. None
-arms, takes off, lands or has a position. ``MAV_CMD_SET_MESSAGE_INTERVAL`` asks for positions while none arrive.
+``MAV_CMD_DO_CHANGE_SPEED`` sets its speed. It waits and goes on by ``MAV_CMD_DO_PAUSE_CONTINUE`` on ArduPilot, and by
+``MAV_CMD_DO_SET_MODE`` with the modes hold and mission elsewhere. None arms, takes off, lands or has a position.
+``MAV_CMD_SET_MESSAGE_INTERVAL`` asks for positions while none arrive, and for the landed state.
 """
 
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 import time
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import Any
 
 from field.errors import VehicleError
@@ -23,7 +25,10 @@ STALE_S = 3.0
 # ArduPilot sends no position unasked: its stream rates are 0 until a ground station sets them (GCS_MAVLink_Parameters;
 # MAVSDK-Python 637), and again after it has started anew. So positions are asked for after this time without one.
 _ASK_S = 1.0
-_POSITIONS_HZ = 4.0
+_POSITIONS_HZ, _LANDED_HZ = 10.0, 1.0
+# MAVSDK's own system ID unless another is asked for, and its number of a vehicle on the ground.
+_SYSTEM_ID, _ON_GROUND = 1, 1
+_PAUSE_CONTINUE, _UNSUPPORTED = 193, 3
 _RELATIVE_FRAMES = {3, 6}
 # The scale of a mission item's latitude and longitude.
 _DEGREES = 1e-7
@@ -42,17 +47,50 @@ def require_mavsdk() -> None:
 
 
 @asynccontextmanager
-async def mavlink_vehicle(url: str, wait_s: float) -> AsyncIterator[MavlinkVehicle]:
+async def mavlink_vehicle(url: str, wait_s: float, system_id: int | None = None) -> AsyncIterator[MavlinkVehicle]:
     """The vehicle at a MAVLink connection, such as ``udpin://0.0.0.0:14540``; closes the connection at the end.
+
+    Args:
+        wait_s: for its first heartbeat, seconds.
+        system_id: of this program; ``None``: the vehicle's, which ArduPilot obeys even where ``MAV_OPTIONS`` lets it
+            obey its own ground station only.
 
     Raises:
         UsageError: the text is no connection, or cannot be opened.
         VehicleError: no autopilot is heard within ``wait_s`` seconds.
     """
-    from mavsdk.asyncio import Autopilot, ComponentType, Configuration, Mavsdk, MavsdkConnectionError
+    from mavsdk.asyncio import Autopilot
 
     _quiet()
-    async with Mavsdk(Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)) as mavsdk:
+    async with AsyncExitStack() as stack:
+        system = await stack.enter_async_context(_connected(url, wait_s, system_id or _SYSTEM_ID))
+        number = await system.get_system_id()
+        if system_id is None and number != _SYSTEM_ID:
+            # MAVSDK takes its own ID at the start, before it hears the vehicle's.
+            await stack.aclose()
+            system = await stack.enter_async_context(_connected(url, wait_s, number))
+        vehicle = MavlinkVehicle(url, system, number, await system.autopilot_type() == Autopilot.ARDUPILOT)
+        listening, ended = asyncio.create_task(vehicle.listen()), asyncio.Event()
+        asking = asyncio.create_task(vehicle.ask_for_telemetry(ended))
+        try:
+            yield vehicle
+        finally:
+            listening.cancel()
+            with suppress(asyncio.CancelledError):
+                await listening
+            # A request under way is in a thread, which needs the connection.
+            ended.set()
+            await asking
+
+
+@asynccontextmanager
+async def _connected(url: str, wait_s: float, system_id: int) -> AsyncIterator[Any]:
+    """MAVSDK's system of the first autopilot at a connection; raises as :func:`mavlink_vehicle`."""
+    from mavsdk.asyncio import ComponentType, Configuration, Mavsdk, MavsdkConnectionError
+
+    configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
+    configuration.system_id = system_id
+    async with Mavsdk(configuration) as mavsdk:
         try:
             await mavsdk.add_any_connection(url)
         except MavsdkConnectionError as error:
@@ -65,18 +103,7 @@ async def mavlink_vehicle(url: str, wait_s: float) -> AsyncIterator[MavlinkVehic
             raise VehicleError(
                 f"--mavlink {url}: no autopilot was heard for {wait_s:g} s; does it send MAVLink to this address?"
             )
-        vehicle = MavlinkVehicle(url, system, await system.autopilot_type() == Autopilot.ARDUPILOT)
-        listening, ended = asyncio.create_task(vehicle.listen()), asyncio.Event()
-        asking = asyncio.create_task(vehicle.ask_for_positions(ended))
-        try:
-            yield vehicle
-        finally:
-            listening.cancel()
-            with suppress(asyncio.CancelledError):
-                await listening
-            # A request under way is in a thread, which needs the connection.
-            ended.set()
-            await asking
+        yield system
 
 
 class MavlinkVehicle:
@@ -85,62 +112,85 @@ class MavlinkVehicle:
     Args:
         name: for messages: its connection.
         system: of MAVSDK.
-        home_is_first: whether the first item of its mission is its home, as in ArduPilot.
+        system_id: of the vehicle.
+        ardupilot: whether it is one: the first item of its mission is its home, and it may pause in its mission.
     """
 
-    def __init__(self, name: str, system: Any, home_is_first: bool) -> None:
+    def __init__(self, name: str, system: Any, system_id: int, ardupilot: bool) -> None:
         from mavsdk.asyncio.plugins.action import ActionAsync
+        from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync
         from mavsdk.asyncio.plugins.mission_raw import MissionRawAsync
+        from mavsdk.asyncio.plugins.param import ParamAsync
         from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 
-        self.name = name
-        self._system, self._home_is_first = system, home_is_first
+        self.name, self.waits_in_mission = name, False
+        self._system, self._system_id, self._ardupilot = system, system_id, ardupilot
         self._telemetry, self._action, self._mission = (
             TelemetryAsync(system),
             ActionAsync(system),
             MissionRawAsync(system),
         )
+        self._direct, self._parameters = MavlinkDirectAsync(system), ParamAsync(system)
         self._position: Any = None
+        self._armed: bool | None = None
         self._heard_s = -math.inf
         self._connected_s = time.monotonic()
 
     async def listen(self) -> None:
-        """Take the positions as they arrive, until it is cancelled."""
+        """Take the positions and heartbeats as they arrive, until it is cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._take_positions())
+            tasks.create_task(self._take_heartbeats())
+
+    async def _take_positions(self) -> None:
         async for position in self._telemetry.subscribe_position():
             self._position, self._heard_s = position, time.monotonic()
 
-    async def ask_for_positions(self, ended: asyncio.Event) -> None:
+    async def _take_heartbeats(self) -> None:
+        async for armed in self._telemetry.subscribe_armed():
+            self._armed = bool(armed)
+
+    async def ask_for_telemetry(self, ended: asyncio.Event) -> None:
         """Ask for positions whenever none has come for a second, until the flight has ended.
 
-        A denied or unanswered request is no failure: arriving positions show whether it took effect.
+        With them it asks for the landed state, and once where positions come unasked but no landed state does. A denied
+        or unanswered request is no failure: what arrives shows whether it took effect.
         """
         from mavsdk.asyncio import MavsdkError
 
+        first = True
         while not ended.is_set():
             with suppress(TimeoutError):
                 await asyncio.wait_for(ended.wait(), _ASK_S)
-            silent_s = time.monotonic() - max(self._heard_s, self._connected_s)
-            if silent_s > _ASK_S and not ended.is_set():
+            silent = time.monotonic() - max(self._heard_s, self._connected_s) > _ASK_S
+            if silent and not ended.is_set():
                 with suppress(MavsdkError):
                     await self._telemetry.set_rate_position(_POSITIONS_HZ)
+            if (silent or first and not await self._telemetry.landed_state()) and not ended.is_set():
+                with suppress(MavsdkError):
+                    await self._telemetry.set_rate_landed_state(_LANDED_HZ)
+            first = False
 
     async def state(self) -> VehicleState:
         """The newest telemetry; a link or a position that was silent for three seconds counts as none."""
         fresh = time.monotonic() - self._heard_s < STALE_S
         at = self._position
         fixed = fresh and math.isfinite(at.latitude_deg) and math.isfinite(at.longitude_deg)
+        landed, flown = int(await self._telemetry.landed_state()), await self._telemetry.velocity_ned()
         return VehicleState(
             connected=bool(await self._system.is_connected()),
-            armed=bool(await self._telemetry.armed()),
+            armed=self._armed,
             mode=_mode(int(await self._telemetry.flight_mode())),
             position=(at.longitude_deg, at.latitude_deg) if fixed else None,
             height_m=at.relative_altitude_m if fixed else 0.0,
+            in_air=landed != _ON_GROUND if landed else None,
+            speed_m_s=math.hypot(flown.north_m_s, flown.east_m_s) if fixed else None,
         )
 
     async def mission(self) -> list[MissionItem]:
         """The mission on board, without ArduPilot's home."""
         items = await self._command("give its mission", self._mission.download_mission())
-        flown = items[1:] if self._home_is_first else items
+        flown = items[1:] if self._ardupilot else items
         return [_item(item) for item in flown]
 
     async def set_speed(self, speed_m_s: float) -> None:
@@ -148,12 +198,38 @@ class MavlinkVehicle:
         await self._command(f"fly at {speed_m_s:g} m/s", self._action.set_current_speed(speed_m_s))
 
     async def hold(self) -> None:
-        """Mode hold."""
+        """Pause in the mission where the autopilot can, else mode hold.
+
+        With ``MIS_RESTART`` 1 an ArduPilot begins its mission again after mode hold, so it is not sent there.
+        """
+        if self._ardupilot and await self._pause(True):
+            self.waits_in_mission = True
+            return
+        if self._ardupilot and await self._command("say MIS_RESTART", self._parameters.get_param_int("MIS_RESTART")):
+            raise VehicleError(f"{self.name} did not hold: its MIS_RESTART begins the mission again; set it to 0")
         await self._command("hold", self._mission.pause_mission())
 
     async def resume(self) -> None:
-        """Mode mission."""
-        await self._command("go on with its mission", self._mission.start_mission())
+        """Go on from the pause, or mode mission."""
+        if not self.waits_in_mission:
+            await self._command("go on with its mission", self._mission.start_mission())
+        elif not await self._pause(False):
+            raise VehicleError(f"{self.name} did not go on with its mission: UNSUPPORTED")
+        self.waits_in_mission = False
+
+    async def _pause(self, pauses: bool) -> bool:
+        """``MAV_CMD_DO_PAUSE_CONTINUE``; returns whether the autopilot knows it, raises if it fails or is denied."""
+        from mavsdk.asyncio.plugins.mavlink_direct import MavlinkMessage
+
+        target = {"target_system": self._system_id, "target_component": 1}
+        fields = target | {"command": _PAUSE_CONTINUE, "confirmation": 0, "param1": int(not pauses)}
+        fields |= {f"param{n}": 0 for n in range(2, 8)}
+        message = MavlinkMessage("COMMAND_LONG", 0, 0, self._system_id, 1, json.dumps(fields))
+        what = "hold" if pauses else "go on with its mission"
+        answer = json.loads((await self._command(what, self._direct.send_command(message))).fields_json)["result"]
+        if answer not in (0, _UNSUPPORTED):
+            raise VehicleError(f"{self.name} did not {what}: MAV_RESULT {answer}")
+        return bool(answer == 0)
 
     async def _command(self, what: str, doing: Any) -> Any:
         from mavsdk.asyncio import MavsdkError
@@ -167,7 +243,7 @@ class MavlinkVehicle:
 
 def _mode(number: int) -> FlightMode:
     """The mode of MAVSDK's number."""
-    names: dict[int, FlightMode] = {3: "hold", 4: "mission", 5: "landing", 6: "landing"}
+    names: dict[int, FlightMode] = {3: "hold", 4: "mission", 5: "returning", 6: "landing"}
     return names.get(number, "other")
 
 

@@ -79,6 +79,9 @@ class Pipeline:
             # The operator may have confirmed orders since the mode's choice.
             velocity = orders.nearest(choice.action.velocity, task.mission.scenario.max_velocity + 1)
             choice = replace(choice, action=Action(choice.action.sensor_id, velocity))
+        fastest = task.mission.belief.drift.fastest([task.uav.uav_id], choice.action.velocity)
+        if fastest < choice.action.velocity and task.mission.guidance.confirmed.allows(fastest):
+            choice = replace(choice, action=Action(choice.action.sensor_id, fastest))
         pending = state.pending(decision_id, choice.action)
         task.watch.ended.append(("check", perf_counter()))
         report = None if choice.advice is None else AdviserReport(choice.model or "", choice.advice)

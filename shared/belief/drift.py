@@ -1,5 +1,6 @@
-"""The drift of a fleet: the true distances flown, learned from the UAVs' reported progress."""
+"""The drift of a fleet: the true distances flown, learned from the UAVs' reported progress and top speeds."""
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -21,12 +22,20 @@ class Drift:
     """The wind's part of a UAV's way: it flies ``v dt (1 + w . h)`` along the heading h, a unit vector.
 
     ``w``, ``(2,)``, is the least-squares estimate of all UAVs' steps, shrunk towards 0; older steps count less.
+
+    Attributes:
+        tops: by UAV, the highest velocity that it reaches, m/s, of the UAVs that have reported one.
     """
 
     def __init__(self) -> None:
         self._normal: FloatArray = np.eye(2) * _PRIOR_STEPS
         self._moment: FloatArray = np.zeros(2)
         self.none = True
+        self.tops: dict[int, int] = {}
+
+    def fastest(self, uavs: Collection[int], limit: int) -> int:
+        """The highest velocity that one of these UAVs reaches, m/s, at most ``limit``."""
+        return min(limit, max((self.tops.get(uav, limit) for uav in uavs), default=limit))
 
     @property
     def wind(self) -> FloatArray:
@@ -66,11 +75,13 @@ class Drift:
 
     def state_dict(self) -> dict[str, Any]:
         """The estimate, as copies."""
-        return {"normal": self._normal.copy(), "moment": self._moment.copy(), "none": self.none}
+        learned = {"normal": self._normal.copy(), "moment": self._moment.copy(), "none": self.none}
+        return learned | {"tops": self.tops.copy()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a ``state_dict``."""
         self._normal, self._moment, self.none = state["normal"], state["moment"], state["none"]
+        self.tops = dict(state.get("tops", {}))
 
 
 def _headings(path: Trajectory, progress_m: FloatArray) -> FloatArray:

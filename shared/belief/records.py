@@ -133,6 +133,8 @@ def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief)
     reported = arrays_of(uav.sensors)
     belief.advance(step)
     belief.locate(uav.uav_id, step, uav.position, uav.progress_m)
+    if uav.top_speed_mps is not None:
+        belief.drift.tops[uav.uav_id] = max(1, round(uav.top_speed_mps))
     belief.hear(reported.ids, reported.places, reported.beacon, reported.queue, reported.battery)
     fresh = reported.beacon == step
     measured = belief.measure(uav.uav_id, reported.ids[fresh], reported.gain[fresh])

@@ -248,9 +248,11 @@ def places_ahead(
     """A UAV's places after one step at each of the V velocity levels, m, ``(V, 2)``.
 
     A UAV off its scenario's trajectory flies an unknown one: its places are then the present one. Without a drift the
-    UAV flies ``v dt``.
+    UAV flies ``v dt``; with one, at most its top speed.
     """
     velocities = np.arange(scenario.max_velocity + 1)
+    if drift is not None:
+        velocities = np.minimum(velocities, drift.fastest([uav], scenario.max_velocity))
     path = trajectories(scenario)[uav]
     progress = progress_of(path, position, progress_m)
     if progress is None:

@@ -216,7 +216,7 @@ class RecedingHorizon:
             stages=None if ahead is None else self._stages(ahead, horizon),
             **links,
             **self._outlook(kept, horizon),
-            **self._guided(kept, horizon),
+            **self._guided(kept, horizon, free),
         )
         before = np.empty((horizon, len(present), 2), dtype=np.int64)
         before[:] = nowhere, problem.levels[-1]
@@ -353,12 +353,16 @@ class RecedingHorizon:
         left = self._scenario.steps - self.step
         return tuple(max(0, min(steps, left - horizon)) if left > 0 else steps for steps in _BEYOND)
 
-    def _guided(self, kept: IntArray, horizon: int) -> dict[str, Any]:
-        """The guidance's part of the problem, for the kept sensors and one nowhere."""
+    def _guided(self, kept: IntArray, horizon: int, free: list[int]) -> dict[str, Any]:
+        """The part of the problem that the guidance and these UAVs' top speeds make, with one sensor nowhere."""
         orders: dict[str, Any] = {}
         world, step = self._scenario, self.step
-        if self.guidance.restricts:
-            orders["allowed"] = self.guidance.allowed(world.max_velocity + 1)
+        fastest = self._belief.drift.fastest(free, world.max_velocity)
+        if self.guidance.restricts or fastest < world.max_velocity:
+            allowed = self.guidance.allowed(world.max_velocity + 1)
+            reached = allowed & (np.arange(len(allowed)) <= fastest)
+            # Where the operator allows only velocities that no UAV reaches, they are still the orders.
+            orders["allowed"] = reached if reached.any() else allowed
         if self.guidance.wishes:
             orders["weights"] = np.append(self.guidance.weights(world.sensors)[kept], 1.0)
             late = self.guidance.lateness(step, self._belief.visited, horizon, self._beyond(horizon)[0])

@@ -150,7 +150,15 @@ class UavState(Received):
     progress_m: float | None = Field(
         None, ge=0, le=1e9, description="m along its trajectory, from its first waypoint (a circle's: due east)"
     )
-    # Both are omitted if not set, for the same reason as an outcome's round trip.
+    # All three are omitted if not set, for the same reason as an outcome's round trip.
+    top_speed_mps: float | None = Field(
+        None,
+        gt=0,
+        le=1000,
+        exclude_if=lambda value: value is None,
+        description="the ground speed that it has not exceeded though it was commanded more: the edge decides on no "
+        "higher velocity, to the nearest m/s, where the operator's orders allow that",
+    )
     base: DecisionId | None = Field(
         None,
         exclude_if=lambda value: value is None,

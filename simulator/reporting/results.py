@@ -93,20 +93,18 @@ def _show_real_uavs(summary: Summary, real: RealUavs, console: Console) -> None:
     """Print each UAV's sums, what was late, and the commands not carried out."""
     table = Table(title="UAVs")
     table.add_column("UAV")
-    for column in ("decisions", "collected", "failed", "lost in range", "round trip, ms"):
+    for column in ("decisions", "collected", "failed", "lost in range", "m decided", "m flown", "round trip, ms"):
         table.add_column(column, justify="right")
     for one in real.uavs:
-        sums = (one.decisions, one.collected, one.failures, one.lost_packets)
-        table.add_row(str(one.uav_id), *(f"{count:,}" for count in sums), number(one.rtt_ms, 0))
-    lost = sum(summary.lost_packets.values())
-    whole = (summary.decisions, sum(one.collected for one in real.uavs), summary.failures, lost)
-    table.add_row("all", *(f"{count:,}" for count in whole), number(summary.rtt_ms.p50, 0), style="bold")
+        sums = (one.decisions, one.collected, one.failures, one.lost_packets, one.decided_m, one.flown_m)
+        table.add_row(str(one.uav_id), *(number(count, 0) for count in sums), number(one.rtt_ms, 0))
+    lost, collected = sum(summary.lost_packets.values()), sum(one.collected for one in real.uavs)
+    metres = sum(one.decided_m for one in real.uavs), sum(one.flown_m for one in real.uavs)
+    whole = (summary.decisions, collected, summary.failures, lost, *metres)
+    table.add_row("all", *(number(count, 0) for count in whole), number(summary.rtt_ms.p50, 0), style="bold")
     console.print(table)
     lines = [late_text(summary)]
     if real.simulated_lost is not None:
         lines.append(f"The simulated sensors lost {real.simulated_lost:,} packets, with those that no UAV heard of.")
-    lines += [f"{count} waypoints without a decision: {why}." for why, count in real.undecided.items()]
-    if real.not_carried_out:
-        lines.append(f"{len(real.not_carried_out)} commands not carried out; the last: {real.not_carried_out[-1]}.")
-    for line in lines:
+    for line in lines + real.remarks():
         console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -39,19 +39,33 @@ class Airframe:
     It computes on a sphere and with its own projection, and shares nothing with what it tests.
 
     Attributes:
-        speed: m/s.
+        speed: m/s, commanded.
+        top, accelerates: m/s and m/s^2; a real ArduCopter accepts 14 m/s, never exceeds 10.97 (REALITY.md, B2), and
+            accelerates along its path at WPNAV_ACCEL, 2.5 m/s^2 unless set.
+        ground_speed: m/s, flown.
         mode: `mission` flies; every other one stays in place.
+        paused: it stays in place in its mission.
         flown_m: metres along the path since its beginning.
         trace: every position that it reported, latitude and longitude.
     """
 
-    def __init__(self, items: list[Item], start_m: float = 0.0, speedup: float = 1.0, speed: float = 5.0) -> None:
+    def __init__(
+        self,
+        items: list[Item],
+        start_m: float = 0.0,
+        speedup: float = 1.0,
+        speed: float = 5.0,
+        top: float = math.inf,
+        accelerates: float = math.inf,
+    ) -> None:
         places = [(item.latitude, item.longitude) for item in items if item.command == 16]
         self._north, self._east = math.radians(places[0][0]), math.radians(places[0][1])
         ring = [self._metres(*place) for place in (*places, places[0])]
         self._legs = list(zip(ring, ring[1:], strict=False))
         self.length_m = sum(math.dist(*leg) for leg in self._legs)
         self.speed, self.mode, self.armed, self.flown_m = speed, "mission", True, start_m
+        self.ground_speed, self.top, self.accelerates = min(speed, top), top, accelerates
+        self.paused = False
         self.drift_m = 0.0
         # It climbs without a way forward, as ArduPilot does in mode AUTO.
         self.climbs_m: float | None = None
@@ -63,14 +77,21 @@ class Airframe:
         """Latitude and longitude now."""
         with self._lock:
             now = time.monotonic()
-            if self.mode == "mission" and self.climbs_m is None:
-                self.flown_m += self.speed * (now - self._at_s) * self._speedup
+            self._fly((now - self._at_s) * self._speedup)
             self._at_s = now
             x, y = self._at(self.flown_m % self.length_m)
             north = self._north + (y + self.drift_m) / EARTH_M
             place = math.degrees(north), math.degrees(self._east + x / (EARTH_M * math.cos(self._north)))
             self.trace.append(place)
             return place
+
+    def _fly(self, seconds: float) -> None:
+        moves = self.mode == "mission" and not self.paused and self.climbs_m is None
+        wanted = min(self.speed, self.top) if moves else 0.0
+        before, most = self.ground_speed, self.accelerates * seconds if seconds else 0.0
+        self.ground_speed += min(max(wanted - before, -most), most)
+        ramp_s = min(seconds, abs(self.ground_speed - before) / self.accelerates)
+        self.flown_m += (before + self.ground_speed) / 2 * ramp_s + self.ground_speed * (seconds - ramp_s)
 
     def height_m(self) -> float:
         """Above the take-off place."""

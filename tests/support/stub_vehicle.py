@@ -41,7 +41,7 @@ class StubVehicle:
         self.commands: list[str | float] = []
         self.lands_at_s = float("inf")
         self.shift_m = 0.0
-        self.deaf = False
+        self.deaf = self.waits_in_mission = False
         self.mode: FlightMode = "mission"
         self.flown_m = 0.0
         self._site, self._path, self._clock, self._wind = site, trajectories(site.scenario)[uav], clock, wind

@@ -11,11 +11,13 @@ from shared.world.scenario import Point
 
 # MAV_CMD numbers, https://mavlink.io/en/messages/common.html
 WAYPOINT, RETURN_TO_LAUNCH, LAND, TAKEOFF, JUMP = 16, 20, 21, 22, 177
-_VTOL_TAKEOFF, _VTOL_LAND, _DELAY = 84, 85, 93
+_VTOL_TAKEOFF, _VTOL_LAND, DELAY = 84, 85, 93
 # Commands up to this number make the vehicle fly somewhere; the ones above change speed, camera and the like.
 _LAST_NAVIGATION = 95
-_STARTS, _ENDS, _STAYS = {TAKEOFF, _VTOL_TAKEOFF}, {RETURN_TO_LAUNCH, LAND, _VTOL_LAND}, {_DELAY}
-FOREVER = -1
+_STARTS, _ENDS, _STAYS = {TAKEOFF, _VTOL_TAKEOFF}, {RETURN_TO_LAUNCH, LAND, _VTOL_LAND}, {DELAY}
+# The repeats of a jump without an end. MAVLink's is -1, but PX4 stores the number as uint16 (mavlink_mission.cpp), and
+# C++ leaves open what becomes of -1. ArduPilot, which stores it as int16, keeps this number, too.
+FOREVER = 32767
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ def path_of(items: Sequence[MissionItem]) -> MissionPath:
             break
         if item.command == JUMP:
             _check_jump(item, items, first_number)
-            if item.parameters[1] != FOREVER:
+            if not repeats_forever(item):
                 _check_end(item, [after for after in items[index + 1 :] if after.command not in _ENDS])
             repeats = True
             break
@@ -99,6 +101,11 @@ def path_of(items: Sequence[MissionItem]) -> MissionPath:
     if len(set(waypoints)) < 2:
         raise ValueError(f"{len(set(waypoints))} waypoints; a path needs at least two that differ")
     return MissionPath(tuple(waypoints), repeats, tuple(altitudes))
+
+
+def repeats_forever(jump: MissionItem) -> bool:
+    """Whether a jump has no end that a flight reaches."""
+    return jump.parameters[1] < 0 or jump.parameters[1] >= FOREVER
 
 
 def items_of(trajectory: Sequence[Point], altitude_m: float) -> list[MissionItem]:

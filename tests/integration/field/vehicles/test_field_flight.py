@@ -136,13 +136,29 @@ async def test_a_uav_that_waited_during_the_decision_flies_faster_after_it() -> 
     assert vehicle.flown_m == pytest.approx(80.0)
 
 
-async def test_the_first_speed_and_that_of_a_late_decision_are_the_decided_ones() -> None:
+async def test_the_speed_of_a_late_decision_is_the_decided_one() -> None:
     trial = Trial()
     uav, vehicle = trial.uavs[0], trial.vehicles[0]
     await uav.update(10.0)
-    await uav.command(6, decided_s=2.0)
+    await trial.clock.until(10.0)
     await uav.command(9, decided_s=10.0)
-    assert vehicle.commands == [6.0, 9.0]
+    await uav.correct(2.0, 8.0)
+    assert vehicle.commands == [9.0]
+
+
+async def test_the_progress_flown_counts_not_the_speed_commanded() -> None:
+    """An airframe that flies half of every commanded speed is corrected until it is where it should be."""
+    trial = Trial(wind=0.5)
+    uav, vehicle, clock = trial.uavs[0], trial.vehicles[0], trial.clock
+    await uav.update(10.0)
+    await uav.command(6)
+    for now_s in (2.0, 4.0, 6.0, 8.0):
+        await clock.until(now_s)
+        await uav.correct(2.0, 10.0 - now_s)
+    await clock.until(10.0)
+    await uav.update(2.0)
+    assert vehicle.commands == [6.0, 6.75, 7.88, 9.84, 14.0]
+    assert uav.flown_m == pytest.approx(6.0 + 6.75 + 7.88 + 9.84 + 14.0, abs=0.1)
 
 
 class Counting:
@@ -203,17 +219,19 @@ async def test_without_an_edge_they_decide_on_board_and_no_two_alike() -> None:
         assert len({d.sensor_id for d in flown.decisions if d.step == step}) == 3
 
 
-async def test_against_the_wind_the_progress_is_the_true_one() -> None:
+async def test_the_progress_and_the_metres_of_the_report_are_the_true_ones() -> None:
     trial = Trial(wind=0.5)
     flown = await trial.fly(nobody(), attempts=1)
     assert len(flown.decisions) == 3 * STEPS
     for request in trial.requests:
         path = trajectories(trial.site.scenario)[request.uav_id]
-        # EOF flies at 7 m/s, of which half is left.
         assert request.progress_m is not None
-        # A lap ends where it begins.
-        assert math.remainder(request.progress_m - 35.0 * request.step, path.length_m) == pytest.approx(0.0, abs=1.0)
         assert path.at(request.progress_m) == pytest.approx(request.position, abs=1.0)
+    for uav, vehicle in enumerate(trial.vehicles):
+        decided_m, flown_m = flown.metres[uav]
+        # EOF flies at 7 m/s, which takes all of the 14 m/s that it may be commanded.
+        assert decided_m == 70.0 * STEPS and flown_m == pytest.approx(vehicle.flown_m, abs=1.0)
+        assert flown_m < 0.95 * decided_m
 
 
 async def test_a_uav_that_lands_gets_no_more_commands_and_the_others_fly_on() -> None:
