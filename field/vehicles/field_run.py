@@ -251,7 +251,8 @@ def check_uploaded(items: Sequence[MissionItem], site: Site, uav: int, vehicle: 
         path = path_of(items)
     except ValueError as error:
         raise UsageError(f"{vehicle}: its mission cannot be flown: {error}") from None
-    flown, route = site.frame.metres(path.trajectory).tolist(), site.scenario.routes[uav]
+    flown = [(x, y) for x, y in site.frame.metres(site.frame.bent(path.trajectory)).tolist()]
+    route = site.scenario.routes[uav]
     for index, (here, there) in enumerate(zip(flown, route, strict=False)):
         gap = math.dist(here, there)
         if not gap <= TOLERANCE_M:
@@ -264,4 +265,7 @@ def check_uploaded(items: Sequence[MissionItem], site: Site, uav: int, vehicle: 
             f"{vehicle}: its mission's path has {len(flown)} waypoints, trajectory {uav} of the world has "
             f"{len(route)}; {remedy}"
         )
+    # Within the tolerance it may still break what the trajectory keeps.
+    if any(fence.first_breach(flown) is not None for fence in site.fences):
+        raise UsageError(f"{vehicle}: its mission leaves the world's fence, or enters a no_fly area; {remedy}")
     return min((height for height in path.altitudes_m if height is not None), default=math.inf)

@@ -256,6 +256,7 @@ def _item(item: Any) -> MissionItem:
         position=(item.y * _DEGREES, item.x * _DEGREES) if placed else None,
         altitude_m=item.z if item.frame in _RELATIVE_FRAMES else None,
         parameters=(item.param1, item.param2),
+        frame=item.frame,
     )
 
 

@@ -23,6 +23,8 @@ def text_of(path: Path, max_bytes: int) -> str:
         raise UnusableFile(f"{path}: {error.strerror or error}") from None
     if len(content) > max_bytes:
         raise UnusableFile(f"{path} is larger than {max_bytes // 1_000_000} MB; leave out what is not needed")
+    if content.startswith(b"PK\x03\x04"):
+        raise UnusableFile(f"{path} is a ZIP archive, as KMZ and zipped shapefiles are; export it as a plain text file")
     content = content.removeprefix(codecs.BOM_UTF8)
     try:
         return content.decode("utf-8")

@@ -16,9 +16,9 @@ class Import:
     """Make the UAVs' trajectories of a world from flight plans of QGroundControl.
 
     The waypoints of each plan become a UAV's trajectory, its geofence an area that no trajectory may leave (inclusion)
-    or enter (exclusion). They go into FOLDER/world.geojson. Sensors and the pipeline that are there stay, and fences
-    where the plans have none; a plan has no sensors, so add them to the file, as features of role sensor. Take-off,
-    landing, camera and speed items are passed over. Exit code: 0 done, 2 bad use or a plan that cannot be flown along
+    or enter (exclusion). They go into FOLDER/world.geojson, where whatever is there stays, but for trajectories. A plan
+    has no sensors, so add them to the file, as features of role sensor. What else a plan has is printed, such as
+    take-off, landing, camera and speed items. Exit code: 0 done, 2 bad use or a plan that cannot be flown along
     straight legs.
 
     Two UAVs over the sensors that world.geojson in north/ already has:
@@ -27,11 +27,11 @@ class Import:
     """
 
     plans: Annotated[Positional[tuple[Path, ...]], arg(metavar="PLAN")]
-    """Files of QGroundControl, one a UAV: the first is UAV 0's."""
+    """Files of QGroundControl (.plan) or Mission Planner (.waypoints), one a UAV: the first is UAV 0's."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
     """The world's folder, made if missing. Required."""
     overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
-    """Replace the trajectories that the world has, and its fences where the plans have some."""
+    """Replace the trajectories that the world has."""
 
 
 @dataclass(frozen=True)
@@ -77,18 +77,15 @@ def import_world(options: Import, console: Console) -> int:
     from simulator.sites.plans.plan_folder import import_plans
 
     if not options.plans:
-        raise UsageError("PLAN is missing: name the .plan file of each UAV")
+        raise UsageError("PLAN is missing: name the .plan or .waypoints file of each UAV")
     if options.out is None:
         raise UsageError("--out is missing: name the world's folder, such as --out north")
     made = import_plans(options.plans, options.out, options.overwrite)
     print(f"Wrote {made.path}: {made.trajectories} trajectories, {made.fences} fences, {made.sensors} sensors.")
-    if made.replaced:
-        print(f"Fences that were there before and that the plans' geofence replaced: {made.replaced}.")
+    for note in made.notes:
+        print(note)
     if not made.sensors:
         print('Add the sensors before you fly it: Points with the properties "role": "sensor" and "id".')
-    if made.altitudes_m:
-        heights = ", ".join(f"{height:g}" for height in sorted(made.altitudes_m))
-        print(f"The waypoints are at {heights} m above take-off; a world has one height: altitude_m in scenario.toml.")
     return 0
 
 

@@ -9,6 +9,9 @@ from pyproj import Proj
 
 from shared.world.channel import FloatArray
 
+# A line that is straight in degrees is drawn in metres to this distance.
+BEND_M = 0.5
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -28,6 +31,30 @@ class Frame:
         """The x and y, ``(N, 2)`` metres, of longitudes and latitudes ``(N, 2)``."""
         longitude, latitude = np.asarray(degrees, dtype=np.float64).reshape(-1, 2).T
         return np.stack(_plane(self.longitude, self.latitude)(longitude, latitude), axis=-1) + self.centre
+
+    def bent(self, degrees: ArrayLike) -> FloatArray:
+        """A line of legs that are straight in degrees (RFC 7946, 3.1.1) with the points between that it has in metres.
+
+        Legs of some kilometres get none. The middle of a leg of length l to the east is about ``l^2 tan(latitude) /
+        8 R`` from the straight line in the plane, 900 m for 200 km. A leg between longitudes that are more than 180
+        degrees apart crosses the antimeridian.
+
+        Args:
+            degrees: longitudes and latitudes, ``(N, 2)``, within some 2,000 km of the centre.
+        """
+        line = np.array(degrees, dtype=np.float64).reshape(-1, 2)
+        shares = np.array([0.25, 0.5, 0.75])[:, None, None]
+        while True:
+            way = np.diff(line, axis=0)
+            way[:, 0] -= np.where(np.abs(way[:, 0]) > 180, np.copysign(360.0, way[:, 0]), 0.0)
+            between = line[:-1] + shares * way
+            between[..., 0] -= np.where(np.abs(between[..., 0]) > 180, np.copysign(360.0, between[..., 0]), 0.0)
+            plane = self.metres(line)
+            gaps = self.metres(between).reshape(between.shape) - (plane[:-1] + shares * np.diff(plane, axis=0))
+            bends = (np.linalg.norm(gaps, axis=-1) > BEND_M).any(axis=0)
+            if not bends.any():
+                return line
+            line = np.insert(line, np.flatnonzero(bends) + 1, between[1, bends], axis=0)
 
     def degrees(self, metres: ArrayLike) -> FloatArray:
         """The longitudes and latitudes, ``(N, 2)``, of points ``(N, 2)`` metres."""

@@ -5,7 +5,7 @@ A seed draws each UAV's start along its trajectory, the initial queues and, with
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,8 @@ from simulator.sites.fence import Fence
 from simulator.sites.files.overrides import read_overrides
 from simulator.sites.files.reading import quoted
 from simulator.sites.files.recordings import read_gains, read_trace
-from simulator.sites.files.survey import Survey, check_complete, read_survey
+from simulator.sites.files.survey import MAX_WAYPOINTS, Survey, check_complete, read_survey
+from simulator.sites.pictured_line import chained, simplified
 from simulator.sites.projection import Frame, centre_of, fit_square, to_metres
 from simulator.sites.site import Site
 
@@ -26,6 +27,8 @@ __all__ = ["ARRIVALS", "FEATURES", "GAINS", "OVERRIDES", "site_from_folder"]
 
 FEATURES, OVERRIDES, ARRIVALS, GAINS = "world.geojson", "scenario.toml", "arrivals.csv", "gains.csv"
 MAX_AREA_M = 1_000_000.0
+# Parts of a pipeline that are nearer than this meet. Beyond this latitude an edge may mean either way around a pole.
+_GAP_M, _POLAR = 1.0, 70.0
 # The most sensors out of reach that a warning names.
 FAR_NAMED = 5
 
@@ -45,10 +48,16 @@ def site_from_folder(
     """
     if not folder.is_dir():
         raise UsageError(f"--world {folder} is no folder; name one that contains {FEATURES}")
-    survey = read_survey(folder / FEATURES)
+    return site_of(read_survey(folder / FEATURES), folder, steps, on_warning)
+
+
+def site_of(
+    survey: Survey, folder: Path, steps: int | None = None, on_warning: Callable[[str], None] = lambda text: None
+) -> Site:
+    """The site of the features that are, or are to be, in a folder, and of its other files; as above."""
     check_complete(folder / FEATURES, survey)
     overrides = read_overrides(folder / OVERRIDES)
-    placed, frame = _scenario_geometry(survey, folder / FEATURES)
+    placed, frame, fences = placed_features(survey, folder / FEATURES, on_warning)
     derived = placed | ({} if steps is None else {"steps": steps})
     if "name" not in overrides.values:
         derived["name"] = _fit_name(folder.resolve().name)
@@ -61,7 +70,7 @@ def site_from_folder(
         read_gains(gains, names, lengths_m) if gains.exists() else None,
         frame,
         tuple(names),
-        _fences(survey, folder / FEATURES, frame, scenario),
+        fences,
     )
     far = [name for name, near in zip(survey.sensors, _reachable(scenario), strict=True) if not near]
     if far:
@@ -73,11 +82,49 @@ def site_from_folder(
     return site
 
 
-def _scenario_geometry(survey: Survey, path: Path) -> tuple[dict[str, object], Frame]:
-    """The fields of a scenario that follow from the features, and the place of its plane on the globe."""
-    lines = [list(survey.sensors.values()), *survey.trajectories.values(), survey.pipeline]
-    degrees = [point for line in lines for point in line]
-    metres = to_metres(degrees)
+def placed_features(
+    survey: Survey, path: Path, on_warning: Callable[[str], None] = lambda text: None
+) -> tuple[dict[str, object], Frame, tuple[Fence, ...]]:
+    """The fields of a scenario that follow from the features, its plane's place on the globe, and the fences in it.
+
+    Raises:
+        UsageError: the features are too far apart, or a trajectory breaks a fence.
+    """
+    drawn = [*survey.trajectories.values(), *survey.pipeline]
+    degrees = [*survey.sensors.values(), *(point for line in drawn for point in line)]
+    _check_extent(path, to_metres(degrees))
+    plane = Frame(*centre_of(degrees), (0.0, 0.0))
+    lines = [np.array(list(survey.sensors.values())).reshape(-1, 2), *map(plane.bent, drawn)]
+    projected = np.round(plane.metres(np.concatenate(lines)), 3)
+    _check_extent(path, projected)
+    metres, side = fit_square(projected)
+    x, y = (metres[0] - projected[0]).tolist()
+    frame = Frame(plane.longitude, plane.latitude, (x, y))
+    sites, *parts = np.split(metres, np.cumsum([len(line) for line in lines])[:-1])
+    routes = [_points(part) for part in parts[: len(survey.trajectories)]]
+    for label, route in zip(survey.trajectories, routes, strict=True):
+        if len(set(route)) < 2:
+            raise UsageError(f"{path}, {label}: all waypoints are the same; a trajectory needs two that differ")
+        if len(route) > MAX_WAYPOINTS:
+            raise UsageError(
+                f"{path}, {label}: its long legs, straight in degrees, are {len(route):,} waypoints in metres, at most "
+                f"{MAX_WAYPOINTS:,}; shorten them"
+            )
+    pipeline, gap_m = chained(parts[len(routes) :])
+    if gap_m > _GAP_M:
+        on_warning(f"{path}: the pipeline's parts are up to {gap_m:,.0f} m apart; pictures show them joined")
+    return {
+        "layout": "surveyed",
+        "sensors": len(sites),
+        "uavs": len(routes),
+        "area_m": side,
+        "sites": _points(sites),
+        "routes": tuple(routes),
+        "pipeline": _points(simplified(pipeline, MAX_WAYPOINTS)),
+    }, frame, _fences(survey, path, frame, routes)  # fmt: skip
+
+
+def _check_extent(path: Path, metres: FloatArray) -> None:
     across = float(np.ptp(metres, axis=0).max()) if np.isfinite(metres).all() else np.inf
     if across > MAX_AREA_M:
         how_far = f"{across / 1000:,.0f} km across" if np.isfinite(across) else "spread around the Earth"
@@ -85,32 +132,22 @@ def _scenario_geometry(survey: Survey, path: Path) -> tuple[dict[str, object], F
             f"{path}: the features are {how_far}, at most {MAX_AREA_M / 1000:,.0f} km fit; look for a swapped or "
             f"mistyped coordinate"
         )
-    projected = metres[0]
-    metres, side = fit_square(metres)
-    x, y = (metres[0] - projected).tolist()
-    frame = Frame(*centre_of(degrees), (x, y))
-    ends = np.cumsum([len(line) for line in lines])[:-1]
-    sites, *routes, pipeline = (_points(part) for part in np.split(metres, ends))
-    for label, route in zip(survey.trajectories, routes, strict=True):
-        if len(set(route)) < 2:
-            raise UsageError(f"{path}, {label}: all waypoints are the same; a trajectory needs two that differ")
-    return {
-        "layout": "surveyed",
-        "sensors": len(sites),
-        "uavs": len(routes),
-        "area_m": side,
-        "sites": sites,
-        "routes": tuple(routes),
-        "pipeline": pipeline,
-    }, frame
 
 
-def _fences(survey: Survey, path: Path, frame: Frame, scenario: Scenario) -> tuple[Fence, ...]:
+def _fences(survey: Survey, path: Path, frame: Frame, routes: Sequence[Sequence[Point]]) -> tuple[Fence, ...]:
     """The fences in the scenario's plane; raises ``UsageError`` for a trajectory that breaks one."""
     fences = []
     for label, drawn in survey.fences.items():
-        fence = Fence(drawn.role, _points(frame.metres(drawn.points)), drawn.radius)
-        for of, route in zip(survey.trajectories, scenario.routes, strict=True):
+        corners = frame.metres(drawn.points) - frame.centre
+        # Not a number, or infinite, on the other side of the Earth.
+        if not np.linalg.norm(corners, axis=1).max() <= 2 * MAX_AREA_M:
+            raise UsageError(f"{path}, {label}: the fence is more than {MAX_AREA_M / 500:,.0f} km away; draw it nearer")
+        apart = np.abs(np.diff(np.array(drawn.points), axis=0))[:, 0]
+        polar = np.abs([latitude for _, latitude in drawn.points[1:]]) > _POLAR
+        if (apart > np.where(polar, 180.0, 359.0)).any():
+            raise UsageError(f"{path}, {label}: an edge goes around the Earth; give it corners that are nearer")
+        fence = Fence(drawn.role, _points(frame.metres(frame.bent(drawn.points))), drawn.radius)
+        for of, route in zip(survey.trajectories, routes, strict=True):
             broken = fence.first_breach(route)
             if broken is not None:
                 does = "leaves the fence" if fence.role == "fence" else "enters the no_fly area"

@@ -11,10 +11,29 @@ from shared.world.scenario import Point
 
 # MAV_CMD numbers, https://mavlink.io/en/messages/common.html
 WAYPOINT, RETURN_TO_LAUNCH, LAND, TAKEOFF, JUMP = 16, 20, 21, 22, 177
-_VTOL_TAKEOFF, _VTOL_LAND, DELAY = 84, 85, 93
-# Commands up to this number make the vehicle fly somewhere; the ones above change speed, camera and the like.
+_VTOL_TAKEOFF, _VTOL_LAND, DELAY, _LAND_START = 84, 85, 93, 189
+# Commands up to this number make the vehicle fly somewhere.
 _LAST_NAVIGATION = 95
 _STARTS, _ENDS, _STAYS = {TAKEOFF, _VTOL_TAKEOFF}, {RETURN_TO_LAUNCH, LAND, _VTOL_LAND}, {DELAY}
+# Commands that leave the path as it is. Any other may change it, such as DO_JUMP_TAG.
+_LEAVES_PATH = {
+    "condition": {112, 114, 115},
+    "speed": {178},
+    "home": {179},
+    "relay or servo": {181, 182, 183, 184},
+    "camera or gimbal": {195, 196, 197, 200, 201, 202, 203, 204, 205, 206, 214, 220, 1000, 1001}
+    | {530, 531, 532, 533, 534, 2000, 2001, 2003, 2500, 2501, 2502, 2503},
+    "geofence switch": {207},
+    "payload": {211, 216, 42600},
+    "autotune, script, auxiliary function or engine": {212, 217, 218, 223},
+    "jump tag": {600},
+    "transition": {3000},
+}
+_PASSED_OVER = {"take-off": _STARTS, "landing": _ENDS | {_LAND_START}, "delay": _STAYS} | _LEAVES_PATH
+_HARMLESS = frozenset().union(*_LEAVES_PATH.values())
+# MAV_FRAME numbers of latitudes and longitudes, by what their heights are above.
+_ABOVE = {0: "mean sea level", 5: "mean sea level", 3: "take-off", 6: "take-off", 10: "the terrain", 11: "the terrain"}
+RELATIVE = {frame for frame, above in _ABOVE.items() if above == "take-off"}
 # The repeats of a jump without an end. MAVLink's is -1, but PX4 stores the number as uint16 (mavlink_mission.cpp), and
 # C++ leaves open what becomes of -1. ArduPilot, which stores it as int16, keeps this number, too.
 FOREVER = 32767
@@ -31,6 +50,8 @@ class MissionItem:
         position: longitude and latitude, degrees; ``None`` without one.
         altitude_m: above the take-off place; ``None`` for another reference, or none.
         parameters: the first two of the command.
+        frame: a MAV_FRAME.
+        height_m: above what the frame says.
     """
 
     where: str
@@ -39,6 +60,16 @@ class MissionItem:
     position: Point | None = None
     altitude_m: float | None = None
     parameters: tuple[float, float] = (0.0, 0.0)
+    frame: int = 3
+    height_m: float | None = None
+
+
+def item_of(where: str, number: int, command: int, frame: int, parameters: Sequence[float | None]) -> MissionItem:
+    """The item of the seven parameters that files write."""
+    first, second, _, _, latitude, longitude, height = parameters
+    position = None if latitude is None or longitude is None else (longitude, latitude)
+    relative = height if frame in RELATIVE else None
+    return MissionItem(where, number, command, position, relative, (first or 0.0, second or 0.0), frame, height)
 
 
 @dataclass(frozen=True)
@@ -81,6 +112,11 @@ def path_of(items: Sequence[MissionItem]) -> MissionPath:
         if item.command in _ENDS:
             _check_end(item, items[index + 1 :])
             break
+        if item.command == _LAND_START:
+            lands = next((at for at in range(index, len(items)) if items[at].command in _ENDS), index)
+            _check_end(item, [after for after in items[index + 1 : lands] if after.command > _LAST_NAVIGATION])
+            _check_end(item, items[lands + 1 :])
+            break
         if item.command == JUMP:
             _check_jump(item, items, first_number)
             if not repeats_forever(item):
@@ -93,10 +129,11 @@ def path_of(items: Sequence[MissionItem]) -> MissionPath:
             if not waypoints or waypoints[-1] != position:
                 waypoints.append(position)
                 altitudes.append(item.altitude_m)
-        elif item.command <= _LAST_NAVIGATION and item.command not in _STARTS | _STAYS:
+        elif item.command not in _HARMLESS | _STARTS | _STAYS:
+            fault = "is no straight leg" if item.command <= _LAST_NAVIGATION else "may change the path"
             raise ValueError(
-                f"{item.where}: command {item.command} is no straight leg; use waypoints (16), with take-off before "
-                "them, and landing, return or a jump to the first one (177) after"
+                f"{item.where}: command {item.command} {fault}; use waypoints (16), with take-off before them, and "
+                "landing, return or a jump to the first one (177) after"
             )
     if len(set(waypoints)) < 2:
         raise ValueError(f"{len(set(waypoints))} waypoints; a path needs at least two that differ")
@@ -106,6 +143,32 @@ def path_of(items: Sequence[MissionItem]) -> MissionPath:
 def repeats_forever(jump: MissionItem) -> bool:
     """Whether a jump has no end that a flight reaches."""
     return jump.parameters[1] < 0 or jump.parameters[1] >= FOREVER
+
+
+def notes_on(items: Sequence[MissionItem]) -> list[str]:
+    """What the items have and a world's trajectory has not, a sentence each."""
+    notes = []
+    kinds = {kind: sum(item.command in commands for item in items) for kind, commands in _PASSED_OVER.items()}
+    if any(kinds.values()):
+        passed = ", ".join(f"{kind} ({count})" for kind, count in kinds.items() if count)
+        notes.append(f"passed over, for they are not the path's: {passed}.")
+    waypoints = [item for item in items if item.command == WAYPOINT]
+    if waits := [item for item in waypoints if item.parameters[0] > 0]:
+        notes.append(f"waits at {len(waits)} waypoints, the first at {waits[0].where}; a world's UAVs fly on.")
+    jump = next((item for item in items if item.command == JUMP), None)
+    if jump is not None and not repeats_forever(jump):
+        notes.append(f"flies {jump.parameters[1] + 1:g} laps; a world's UAVs fly on.")
+    heights: dict[str, list[float]] = {}
+    for item in waypoints:
+        if item.height_m is not None:
+            heights.setdefault(_ABOVE[item.frame], []).append(item.height_m)
+    if heights:
+        ranges = (
+            f"{min(of):g}{f' to {max(of):g}' if max(of) > min(of) else ''} m above {above}"
+            for above, of in heights.items()
+        )
+        notes.append(f"waypoints at {' and at '.join(ranges)}; a world has one height: altitude_m in scenario.toml.")
+    return notes
 
 
 def items_of(trajectory: Sequence[Point], altitude_m: float) -> list[MissionItem]:
@@ -127,13 +190,18 @@ def items_of(trajectory: Sequence[Point], altitude_m: float) -> list[MissionItem
 def _position(item: MissionItem) -> Point:
     if item.position is None or not all(math.isfinite(value) for value in item.position) or item.position == (0, 0):
         raise ValueError(f"{item.where}: the waypoint has no position; give it a latitude and a longitude")
+    if item.frame not in _ABOVE:
+        raise ValueError(f"{item.where}: frame {item.frame} is not global; give a latitude and a longitude (frame 3)")
+    longitude, latitude = item.position
+    if abs(longitude) > 180 or abs(latitude) > 90:
+        raise ValueError(f"{item.where}: {latitude:g}, {longitude:g} is no latitude and longitude in degrees")
     return item.position
 
 
 def _check_end(end: MissionItem, after: Sequence[MissionItem]) -> None:
     """Raises ``ValueError`` where the vehicle flies on after the item that ends the path."""
     for item in after:
-        if item.command <= _LAST_NAVIGATION or item.command == JUMP:
+        if item.command not in _HARMLESS:
             raise ValueError(
                 f"{item.where}: command {item.command} comes after {end.where} (command {end.command}), where the path "
                 "ends; make a plan of its own of what is flown then, or take it out"
@@ -145,7 +213,7 @@ def _check_jump(item: MissionItem, items: Sequence[MissionItem], first_number: i
     target = int(item.parameters[0])
     before = [other.number for other in items if first_number is not None and other.number < first_number]
     # A jump to an item between take-off and the first waypoint also begins the path again.
-    allowed = {other.number for other in items if other.number in before and other.command > _LAST_NAVIGATION}
+    allowed = {other.number for other in items if other.number in before and other.command in _HARMLESS}
     if first_number is None or target not in allowed | {first_number}:
         raise ValueError(f"{item.where}: it jumps to item {target}; only a jump to the first waypoint can be flown")
     if item.parameters[1] == 0:
