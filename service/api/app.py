@@ -8,6 +8,8 @@ from typing import TypedDict
 
 import torch
 from fastapi import FastAPI
+from fastapi.routing import APIRoute
+from starlette.middleware.gzip import GZipMiddleware
 
 from service.api import live_routes as live_routes
 from service.api import problem_details
@@ -78,7 +80,10 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     )
     # include_router would build each route once more, on the first request.
     app.router.routes += [*decisions.routes, *router.routes, *live_routes.router.routes]
-    app.mount("/static", live_routes.ASSETS, name="static")
+    app.mount("/static", GZipMiddleware(live_routes.ASSETS, minimum_size=1000), name="static")
+    for route in live_routes.router.routes:
+        if isinstance(route, APIRoute) and route.path in ("/", "/missions"):
+            route.app = GZipMiddleware(route.app, minimum_size=1000)
     app.add_middleware(RequestLimits, most=settings.max_requests, limit=settings.max_body_bytes)
     if settings.keys is not None:
         app.add_middleware(KeyAuthentication, keys=ApiKeys(settings.keys))

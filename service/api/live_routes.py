@@ -33,6 +33,7 @@ _SECURITY_HEADERS = {
     # The browser validates each time, and gets 304 if nothing changed.
     "Cache-Control": "no-cache",
 }
+EVENTS = "text/event-stream"
 _MOST_LISTED = 200
 _KEY_CHECK_S = 1.0
 
@@ -63,7 +64,7 @@ ASSETS = Assets(directory=STATIC)
 class EventStream(StreamingResponse):
     """Server-sent events to one listener; they end when it stops reading or its key is removed."""
 
-    media_type = "text/event-stream"
+    media_type = EVENTS
 
     def __init__(self, live: Broadcaster, events: AsyncGenerator[bytes], still_known: Callable[[], bool]) -> None:
         self._events = self._while_known(events, still_known)
@@ -130,8 +131,14 @@ async def list_missions(engine: TheEngine, request: Request) -> MissionList:
     )
 
 
-# Not in the schema: an endless stream, which its first event describes.
-@router.get("/missions/{mission_id}/events", include_in_schema=False, dependencies=[Depends(_listener)])
+@router.get(
+    "/missions/{mission_id}/events",
+    status_code=200,
+    response_class=EventStream,
+    responses={200: {"content": {EVENTS: {"schema": {"type": "string"}}}}, **documented(404, 421, 422, 503)},
+    tags=["missions"],
+    dependencies=[Depends(_listener)],
+)
 async def events(mission_id: MissionId, engine: TheEngine, request: Request) -> EventStream:
     """A mission's events: ``snapshot``, then ``update`` at most ten times a second; ``gone`` if it is deleted.
 

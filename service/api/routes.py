@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Request, Response
 from fastapi.routing import APIRoute
-from prometheus_client import generate_latest
 from pydantic import ValidationError
 
 from service.api import attention_weights
@@ -217,9 +216,10 @@ async def readyz(request: Request, response: Response) -> Readiness:
 
 @router.get("/metrics", tags=["operation"], response_class=Response)
 async def metrics(request: Request) -> Response:
-    """Prometheus metrics."""
+    """Prometheus metrics, as OpenMetrics where the request's Accept header names it."""
     owned: Metrics = request.state.metrics
     owned.tasks.set(len(asyncio.all_tasks()))
     llm: ServerPool = request.state.llm
     owned.record_llm(llm.statuses, llm.breakers_open)
-    return Response(generate_latest(owned.registry), media_type="text/plain; version=0.0.4; charset=utf-8")
+    content, content_type = owned.exposed(request.headers.get("accept", ""))
+    return Response(content, headers={"Content-Type": content_type})

@@ -6,8 +6,18 @@ from importlib.metadata import version
 
 import numpy as np
 from numpy.typing import ArrayLike
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, Summary
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    Info,
+    Summary,
+    disable_created_metrics,
+    generate_latest,
+)
 from prometheus_client.core import Metric
+from prometheus_client.exposition import choose_encoder
 from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
@@ -55,10 +65,25 @@ class ArrayHistogram(Collector):
         yield metric
 
 
+class _AsOpenMetrics(Collector):
+    """A registry's metrics, as OpenMetrics allows them: a histogram with a bound below 0 has neither sum nor count."""
+
+    def __init__(self, registry: CollectorRegistry) -> None:
+        self._registry = registry
+
+    def collect(self) -> Iterable[Metric]:
+        for metric in self._registry.collect():
+            if any(sample.labels.get("le", "").startswith("-") for sample in metric.samples):
+                metric.samples = [sample for sample in metric.samples if "le" in sample.labels]
+            yield metric
+
+
 class Metrics:
     """The metrics of one edge, in their own registry."""
 
     def __init__(self) -> None:
+        # A series for each series, of no use to Prometheus.
+        disable_created_metrics()
         self.registry = CollectorRegistry()
         ProcessCollector(registry=self.registry)
         PlatformCollector(registry=self.registry)
@@ -154,6 +179,13 @@ class Metrics:
         for status in _STATUSES:
             self.llm_servers.labels(status).set(statuses.get(status, 0))
         self.llm_breaker_open.set(breakers_open)
+
+    def exposed(self, accepted: str) -> tuple[bytes, str]:
+        """All metrics and their content type: OpenMetrics where an Accept header names it, else Prometheus's text."""
+        if "application/openmetrics-text" not in accepted:
+            return generate_latest(self.registry), "text/plain; version=0.0.4; charset=utf-8"
+        encode, content_type = choose_encoder(accepted)
+        return encode(_AsOpenMetrics(self.registry)), content_type
 
     def record_measured(self, measured: Measured) -> None:
         """Count the measurements of one report."""

@@ -24,7 +24,10 @@ _HEADERS = {
 
 
 class SecurityHeaders:
-    """Pure ASGI middleware: a browser does not cache answers, frame them, or guess another content type."""
+    """Pure ASGI middleware: a browser does not cache answers, frame them, or guess another content type.
+
+    A HEAD request is answered as GET; the server leaves out the body. A stream of events has no HEAD.
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -38,7 +41,12 @@ class SecurityHeaders:
                     headers.setdefault(name, value)
             await send(message)
 
-        return self.app(scope, receive, send_with_headers if scope["type"] == "http" else send)
+        if scope["type"] != "http":
+            return self.app(scope, receive, send)
+        # The server keeps the original scope, by which it knows HEAD.
+        if scope["method"] == "HEAD" and not scope["path"].endswith("/events"):
+            scope = {**scope, "method": "GET"}
+        return self.app(scope, receive, send_with_headers)
 
 
 # As in service.api.routes.

@@ -24,6 +24,8 @@ CASES = [
     (path, method, mode)
     for path, methods in create_app(Settings(mode="value")).openapi()["paths"].items()
     for method, operation in methods.items()
+    # A stream of events has no end.
+    if not path.endswith("/events")
     # Without a parameter or a body there is nothing to get wrong.
     for mode in (
         list(GenerationMode) if {"parameters", "requestBody"} & operation.keys() else [GenerationMode.POSITIVE]
