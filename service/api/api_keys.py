@@ -145,6 +145,12 @@ class ApiKeys:
                 f"{path} has no key, so every request would fail. Make one with: aicvds keys add NAME --file {path}"
             )
 
+    @property
+    def lost(self) -> bool:
+        """Whether the file cannot be read, so that the previous keys apply."""
+        self._refresh()
+        return self._last_error != ""
+
     def find(self, presented: str) -> ApiKey | None:
         """The record of a presented key, if there is one. Every key is compared, each in constant time."""
         self._refresh()
@@ -160,7 +166,7 @@ class ApiKeys:
             return
         self._checked_at = self._clock()
         stamp = self._stamp()
-        if stamp == self._read_stamp:
+        if stamp == self._read_stamp and not self._last_error:
             return
         try:
             self._keys = KeyFile.read(self._path).keys

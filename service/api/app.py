@@ -15,6 +15,7 @@ from service.api import live_routes as live_routes
 from service.api import problem_details
 from service.api.api_keys import ApiKeys
 from service.api.authentication import KeyAuthentication
+from service.api.host_names import KnownHosts
 from service.api.load_limits import RequestLimits
 from service.api.openapi import schema_of
 from service.api.routes import decisions, router
@@ -36,6 +37,7 @@ class RequestState(TypedDict):
     engine: Engine
     llm: ServerPool
     metrics: Metrics
+    keys: ApiKeys | None
 
 
 def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
@@ -48,6 +50,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         BadKeys: the file of keys that the settings name cannot be used.
     """
 
+    keys = None if settings.keys is None else ApiKeys(settings.keys)
     traces = Traces(provider_from_environment(version("aic-vds")), settings)
 
     @asynccontextmanager
@@ -62,7 +65,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         llm.start()
         try:
             await asyncio.to_thread(load_for_event_loop)
-            yield {"engine": engine, "llm": llm, "metrics": metrics}
+            yield {"engine": engine, "llm": llm, "metrics": metrics, "keys": keys}
         finally:
             may_close = await engine.close()
             await llm.close()
@@ -75,6 +78,10 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         version=version("aic-vds"),
         summary="Which sensor to collect from, and how fast to fly",
         lifespan=lifespan,
+        # Their scripts come from a public host, and a redirect would repeat any Host.
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
         # The edge's own traces have a span for each decision; FastAPI would look for a provider at each request.
         telemetry={"tracing": False, "metrics": False, "logs": False},
     )
@@ -85,8 +92,9 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         if isinstance(route, APIRoute) and route.path in ("/", "/missions"):
             route.app = GZipMiddleware(route.app, minimum_size=1000)
     app.add_middleware(RequestLimits, most=settings.max_requests, limit=settings.max_body_bytes)
-    if settings.keys is not None:
-        app.add_middleware(KeyAuthentication, keys=ApiKeys(settings.keys))
+    if keys is not None:
+        app.add_middleware(KeyAuthentication, keys=keys)
+    app.add_middleware(KnownHosts, settings=settings)
     app.add_middleware(SecurityHeaders)
     if traces.provider is not None:
         app.add_middleware(Traced)

@@ -2,12 +2,16 @@
 
 import gzip
 import hashlib
+import re
 from http import HTTPStatus
 
 from fastapi import Response
 
 from service.mission.mission import Mission
 from shared.wire.missions import MissionAttention, WeightArray
+
+# gzip in Accept-Encoding, unless its weight is 0.
+_GZIP = re.compile(r"gzip(\s*;\s*q\s*=(?!\s*0(\.0*)?$).*)?")
 
 
 def attention_of(mission: Mission) -> MissionAttention:
@@ -43,7 +47,7 @@ def attention_response(mission: Mission, known_tags: str | None, encodings: str)
     tags = [tag.strip().removeprefix("W/") for tag in (known_tags or "").split(",")]
     if etag in tags or tags == ["*"]:
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    if "gzip" in encodings:
+    if any(_GZIP.fullmatch(one.strip()) for one in encodings.lower().split(",")):
         body = gzip.compress(body, 6, mtime=0)
         headers["Content-Encoding"] = "gzip"
     return Response(body, media_type="application/json", headers=headers)

@@ -2,15 +2,16 @@
 
 import math
 import re
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
-from throttled import MemoryStore, RateLimiterType, Throttled, per_min
 
 from service.api.api_keys import MOST_KEYS, ApiKey, ApiKeys, Scope
 from service.api.load_limits import READING
 from service.api.problem_details import problem_response
+from shared.kit.bounded import BoundedDict
 
 # Resources without mission data. Probes of containers and load balancers carry no key.
 _OPEN = frozenset(("/healthz", "/readyz", "/"))
@@ -18,8 +19,7 @@ _OPEN = frozenset(("/healthz", "/readyz", "/"))
 _OPEN_PREFIX = "/static/"
 _ATTENTION = re.compile(r"/missions/[^/]+/attention")
 _READINGS = re.compile(r"/missions/[^/]+/readings")
-# Counters of a key in memory: of this minute, the previous one, and expired ones.
-_COUNTS_A_KEY = 4
+_MINUTE_S = 60.0
 # The ASGI scope's entry with the scopes of the request's key.
 SCOPES = "aicvds.scopes"
 # The ASGI scope's entry for streams: a function that returns whether the key is still known.
@@ -45,14 +45,16 @@ def is_open(method: str, path: str) -> bool:
 class KeyAuthentication:
     """Pure ASGI middleware: 401 without a known key, 403 without the scope, 429 with ``Retry-After`` past the rate.
 
-    It answers before the body is read. Clients send keys as ``Authorization: Bearer KEY``.
+    It answers before the body is read. Clients send keys as ``Authorization: Bearer KEY``. A key's requests of a minute
+    may come at once, and then evenly (the generic cell rate algorithm).
     """
 
-    def __init__(self, app: ASGIApp, keys: ApiKeys) -> None:
+    def __init__(self, app: ASGIApp, keys: ApiKeys, clock: Callable[[], float] = time.monotonic) -> None:
         self.app = app
         self._keys = keys
-        self._counts = MemoryStore(options={"MAX_SIZE": _COUNTS_A_KEY * MOST_KEYS})
-        self._limiters: dict[int, Throttled] = {}
+        self._clock = clock
+        # When a key's requests so far would have ended had they come evenly; by rate, so that another one begins anew.
+        self._even_end_s = BoundedDict[tuple[str, int], float](4 * MOST_KEYS)
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or is_open(scope["method"], scope["path"]):
@@ -80,13 +82,13 @@ class KeyAuthentication:
 
     def _wait(self, key: ApiKey) -> int | None:
         """Seconds until the key's next request is allowed; None if this one is, which then counts."""
-        limiter = self._limiters.get(key.per_minute)
-        if limiter is None:
-            window, quota = RateLimiterType.SLIDING_WINDOW.value, per_min(key.per_minute)
-            limiter = self._limiters[key.per_minute] = Throttled(using=window, quota=quota, store=self._counts)
-        # A key whose rate was changed gets a new counter.
-        found = limiter.limit(f"{key.name}:{key.per_minute}")
-        return max(1, math.ceil(found.state.retry_after)) if found.limited else None
+        now, each_s = self._clock(), _MINUTE_S / key.per_minute
+        ends = max(now, self._even_end_s.get((key.name, key.per_minute), now)) + each_s
+        # A millionth of a second is rounding.
+        if (wait_s := ends - now - _MINUTE_S) > 1e-6:
+            return math.ceil(wait_s)
+        self._even_end_s[key.name, key.per_minute] = ends
+        return None
 
 
 def _presented(headers: Sequence[tuple[bytes, bytes]]) -> str:

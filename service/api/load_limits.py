@@ -4,6 +4,7 @@ import asyncio
 import re
 import zlib
 from collections.abc import Awaitable, Callable
+from itertools import islice
 
 import zstandard
 from starlette.responses import Response
@@ -18,10 +19,16 @@ READING = ("GET", "HEAD")
 _UNCOUNTED = re.compile(r"/(healthz|readyz|metrics|static/.*|missions/[^/]+/events)?")
 # While a body arrives, its request counts against the limit of concurrent requests.
 _BODY_S = 10.0
+# A fleet's report has some thousand names of fields, columns' values none.
+_NAME, _MOST_NAMES = re.compile(rb'"\s*:'), 20_000
 
 
 class _TooLarge(Exception):
     """The body exceeds the limit, before or after decompression."""
+
+
+class _TooManyNames(Exception):
+    """The body has more names than any request: to parse them all would take most of a second."""
 
 
 class _Damaged(Exception):
@@ -111,7 +118,9 @@ class RequestLimits:
                 return None
             if encoding in _DECODERS:
                 body = _DECODERS[encoding](body, self._limit)
-        except (_TooLarge, TimeoutError, _Damaged) as fault:
+            if len(list(islice(_NAME.finditer(body), _MOST_NAMES + 1))) > _MOST_NAMES:
+                raise _TooManyNames
+        except (_TooLarge, TimeoutError, _Damaged, _TooManyNames) as fault:
             await self._refusal(fault)(scope, receive, send)
             return None
         if encoding in _DECODERS or b"content-length" not in headers:
@@ -127,10 +136,12 @@ class RequestLimits:
                 problem = f"not received within {_BODY_S:g} s, or in less while {self._most} requests are in progress"
             case _Damaged():
                 status, problem = 400, str(fault)
+            case _TooManyNames():
+                status, problem = 422, f"has more than {_MOST_NAMES} names"
             case _:
                 status, problem = 413, f"larger than {self._limit} bytes"
         response = problem_response(status, f"body: {problem}", [{"field": "body", "problem": problem}])
-        if status != 400:
+        if status not in (400, 422):
             response.headers["Connection"] = "close"
         return response
 

@@ -7,11 +7,12 @@ from operator import attrgetter
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Request, Response
+from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import ValidationError
 
 from service.api import attention_weights
-from service.api.api_keys import Scope
+from service.api.api_keys import ApiKeys, Scope
 from service.api.authentication import SCOPES
 from service.api.problem_details import documented
 from service.edge.engine import Engine
@@ -54,8 +55,12 @@ class DecideRoute(APIRoute):
                 return await general(request)
             try:
                 body = DecideRequest.model_validate_json(await request.body())
-            except ValidationError:
-                return await general(request)
+            except ValidationError as error:
+                faults = error.errors(include_url=False)
+                if faults[0]["type"] == "json_invalid":
+                    return await general(request)
+                # It is validated once: a large body takes long.
+                raise RequestValidationError([{**f, "loc": ("body", *f["loc"])} for f in faults]) from None
             return await decide(body, request, key)
 
         return handler
@@ -75,6 +80,11 @@ def may_command(request: Request) -> bool:
     """Whether the request may make, guide and delete missions: with keys, only scope ``admin`` may."""
     scopes: frozenset[Scope] | None = request.scope.get(SCOPES)
     return scopes is None or "admin" in scopes
+
+
+def _keys_lost(request: Request) -> bool:
+    keys: ApiKeys | None = request.state.keys
+    return keys is not None and keys.lost
 
 
 TheEngine = Annotated[Engine, Depends(_engine)]
@@ -208,6 +218,8 @@ async def readyz(request: Request, response: Response) -> Readiness:
     llm: ServerPool = request.state.llm
     engine: Engine = request.state.engine
     readiness = llm.readiness()
+    if _keys_lost(request):
+        readiness = readiness.model_copy(update={"detail": "the file of keys cannot be read: the previous keys apply"})
     if engine.missions.intact:
         return readiness
     response.status_code = 503
@@ -220,6 +232,7 @@ async def metrics(request: Request) -> Response:
     owned: Metrics = request.state.metrics
     owned.tasks.set(len(asyncio.all_tasks()))
     llm: ServerPool = request.state.llm
+    owned.keys_lost.set(_keys_lost(request))
     owned.record_llm(llm.statuses, llm.breakers_open)
     content, content_type = owned.exposed(request.headers.get("accept", ""))
     return Response(content, headers={"Content-Type": content_type})

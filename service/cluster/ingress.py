@@ -14,6 +14,7 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.types import Receive, Scope, Send
 
+from service.api.host_names import KnownHosts
 from service.api.load_limits import RequestLimits
 from service.api.problem_details import problem_response
 from service.cluster.exchange import Exchanged
@@ -185,14 +186,20 @@ def ingress_application(settings: Settings, owners: Owners, end: Callable[[], No
     async def alive(_: Any) -> Response:
         return JSONResponse({"status": "ok"})
 
+    async def failed(_: Any, error: Exception) -> Response:
+        log.error("the ingress failed", exc_info=error)
+        return problem_response(500, "the edge failed; its log has the details")
+
     async def passed_on(scope: Scope, receive: Receive, send: Send) -> None:
         await app.state.engine(scope, receive, send)
 
     app = Starlette(
         routes=[Route("/healthz", alive), Mount("/", passed_on)],
         lifespan=lifespan,
+        exception_handlers={Exception: failed},
         middleware=[
             Middleware(SecurityHeaders),
+            Middleware(KnownHosts, settings=settings),
             Middleware(RequestLimits, most=settings.max_requests, limit=settings.max_body_bytes),
         ],
     )

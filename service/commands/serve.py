@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import ipaddress
 import os
+import signal
 import socket
 import sys
 from collections.abc import Callable
@@ -62,7 +63,7 @@ class ServeOptions:
 
 
 def main(argv: list[str]) -> int:
-    """Serve until SIGTERM or Ctrl-C; returns the exit code."""
+    """Serve until SIGTERM (exit code 0) or Ctrl-C; returns the exit code."""
     # GNU OpenMP's threads spin at llama.cpp's barriers, even while another process has the core that they wait for. The
     # library reads this variable once, when torch loads it.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
@@ -86,6 +87,8 @@ def main(argv: list[str]) -> int:
         return _refused(f"cannot listen on {args.host}:{args.port}: {error.strerror or error}{other}")
     host = f"[{args.host}]" if ":" in args.host else args.host
     url = f"http://{host}:{listener.getsockname()[1]}"
+    # uvicorn raises the signal again once it has ended.
+    on_sigterm = signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     try:
         # The system queues requests from here on. /healthz answers immediately, the other routes once torch is loaded.
         print(f"aicvds serve: listening on {url}, loading", file=sys.stderr, flush=True)
@@ -98,6 +101,7 @@ def main(argv: list[str]) -> int:
     except KeyboardInterrupt:
         return 130
     finally:
+        signal.signal(signal.SIGTERM, on_sigterm)
         gc.enable()
 
 

@@ -158,6 +158,9 @@ class Settings(BaseSettings):
     keys: Path | None = None
     # Whether requests to an address other than loopback need no key.
     anonymous: Literal["on", "off"] = "off"
+    # Names by which clients reach an edge without keys, separated by commas, besides this machine's own. `*`: any name,
+    # where a proxy before the edge checks it.
+    hosts: str = ""
     # Largest body in bytes, compressed or not, after decompression: 2,000 sensors take 0.08 to 0.16 MB.
     max_body_bytes: int = Field(2_000_000, ge=1_000, le=1_000_000_000)
     # Whether an LLM's answer must obey hard rules in mode `llm`: sensor in reach, battery not flat. The policy

@@ -138,6 +138,12 @@ class Metrics:
             "aicvds_critic_timeouts", "Decisions of mode guided whose rollout evaluator was late or failed", registry=r
         )
 
+        self.keys_lost = Gauge(
+            "aicvds_keys_lost",
+            "Whether the file of API keys cannot be read and the previous keys apply",
+            registry=r,
+        )
+
     def _add_outcomes(self) -> None:
         """The metrics of outcomes and reports."""
         r = self.registry

@@ -30,9 +30,10 @@ _TAKEN_BYTES, _TAKEN_S = 16 * 1024, 30.0
 _UNSENT_BYTES = 128 * 1024
 # Pipelined requests that wait in one connection. One read of the socket could bring 14,000.
 _MOST_WAITING = 16
-_PROBLEM = Problem(
+_TOO_LARGE = Problem(
     title="Request Header Fields Too Large", status=431, detail=f"the headers are larger than {_MOST_BYTES} bytes"
 )
+_NO_HTTP = Problem(title="Bad Request", status=400, detail="the request is no valid HTTP/1.1")
 
 
 class _OncePerMinute(logging.Filter):
@@ -147,12 +148,13 @@ class BoundedHttpProtocol(HttpToolsProtocol):
         if self._refused:
             self._refuse()
         else:
-            super().send_400_response(msg)
+            self.transport.write(_refusal(self.server_state.default_headers, _NO_HTTP))
+            self.transport.close()
 
     def _refuse(self) -> None:
         # While another answer is pending or has begun, the connection is closed without a 431.
         if self.cycle is None or self.cycle.response_complete:
-            self.transport.write(_refusal(self.server_state.default_headers))
+            self.transport.write(_refusal(self.server_state.default_headers, _TOO_LARGE))
         self.transport.close()
 
     def _start_asgi_task(self, cycle: RequestResponseCycle, app: Any) -> None:
@@ -187,12 +189,12 @@ def most_connections() -> int:
     return max(16, min(_MOST_CONNECTIONS, files - _OTHER_FILES))
 
 
-def _refusal(default_headers: list[tuple[bytes, bytes]]) -> bytes:
-    body = _PROBLEM.model_dump_json().encode()
+def _refusal(default_headers: list[tuple[bytes, bytes]], problem: Problem) -> bytes:
+    body = problem.model_dump_json().encode()
     headers: list[tuple[bytes, Any]] = [
         *default_headers,
         (b"content-type", b"application/problem+json"),
         (b"content-length", str(len(body)).encode()),
         (b"connection", b"close"),
     ]
-    return STATUS_LINE[431] + b"".join(b"%s: %s\r\n" % line for line in headers) + b"\r\n" + body
+    return STATUS_LINE[problem.status] + b"".join(b"%s: %s\r\n" % line for line in headers) + b"\r\n" + body

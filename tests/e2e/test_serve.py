@@ -178,7 +178,7 @@ def test_it_stops_when_asked_in_its_first_second() -> None:
         assert httpx.get(f"{url}/healthz", timeout=PATIENCE_S).status_code == 200
         process.send_signal(ask)
         output, _ = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode in (0, 130, -ask)
+    assert process.returncode == 0
     assert "Traceback" not in output
 
 
@@ -188,12 +188,12 @@ def test_a_decision_asked_for_before_it_is_loaded_is_answered(report: Callable[.
     assert (answer.status_code, answer.json()["source"]) == (200, "policy")
 
 
-def test_the_edge_stops_when_asked() -> None:
-    ask = signal.SIGINT
+@pytest.mark.parametrize(("ask", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
+def test_the_edge_stops_when_asked(ask: signal.Signals, code: int) -> None:
     with serving_edge() as (url, process):
         assert httpx.get(f"{url}/readyz", timeout=PATIENCE_S).status_code == 200
         process.send_signal(ask)
-        assert process.wait(PATIENCE_S) in (0, 130, -ask)
+        assert process.wait(PATIENCE_S) == code
 
 
 def test_a_decision_in_flight_is_answered_before_the_edge_stops(report: Callable[..., dict[str, Any]]) -> None:
@@ -221,7 +221,7 @@ def test_a_decision_in_flight_is_answered_before_the_edge_stops(report: Callable
 @pytest.mark.long
 def test_who_has_connected_before_the_edge_stops_is_answered(report: Callable[..., dict[str, Any]]) -> None:
     body = json.dumps(report(mission_id="default")).encode()
-    head = "POST /decide HTTP/1.1\r\nHost: edge\r\nContent-Type: application/json\r\n"
+    head = "POST /decide HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     head += f"Content-Length: {len(body)}\r\n\r\n"
     with serving_edge(AICVDS_MODE="policy") as (url, process):
         assert httpx.get(f"{url}/readyz", timeout=PATIENCE_S).status_code == 200

@@ -92,3 +92,15 @@ def test_a_key_for_decisions_is_needed(edge: Edge, tmp_path: Path) -> None:
     assert client.get(PATH, headers=bearer(keys["decide"])).status_code == 200
     # A mission of that name is read with any key, as others are.
     assert client.get("/missions/attention", headers=bearer(keys["admin"])).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("accepted", "packed"),
+    [("gzip", True), ("br, GZIP;q=0.5", True), ("gzip;q=0", False), ("gzip ; q=0.0, *", False), ("x-gzip", False)],
+)
+def test_it_is_packed_only_for_who_unpacks_it(edge: Edge, accepted: str, packed: bool) -> None:
+    client = edge()
+    client.put("/missions/test", json={}).raise_for_status()
+    answer = client.get(PATH, headers={"Accept-Encoding": accepted})
+    assert ("content-encoding" in answer.headers) is packed
+    assert MissionAttention.model_validate_json(answer.content).mission_id == "test"

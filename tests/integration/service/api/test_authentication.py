@@ -14,6 +14,7 @@ import httpx
 import pytest
 
 from service.api.api_keys import ApiKeys, BadKeys, KeyFile, Scope, editing
+from service.api.authentication import KeyAuthentication
 from service.commands.keys import main
 from shared.client.edge_client import EdgeClient
 from shared.client.errors import EdgeRefused
@@ -93,6 +94,67 @@ def test_a_key_that_asks_too_often_is_told_to_wait(edge: Edge, report: Report, t
     assert [answer.status_code for answer in answers] == [200] * 5 + [429] * 2
     assert 1 <= int(answers[-1].headers["retry-after"]) <= 60
     assert client.post("/decide", json=report(), headers=bearer(other)).status_code == 200
+
+
+def test_neither_a_second_nor_a_wall_clock_that_jumps_gives_more_requests(
+    edge: Edge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, now, behind = KeyFile(), time.time, [0.0]
+    key = bearer(file.add("fleet", frozenset({"decide"}), per_minute=3))
+    file.write(tmp_path / "keys.json")
+    client = edge(keys=tmp_path / "keys.json")
+    assert [client.get("/missions", headers=key).status_code for _ in range(4)] == [200, 200, 200, 429]
+    monkeypatch.setattr("time.time", lambda: now() + behind[0])
+    monkeypatch.setattr("time.time_ns", lambda: int((now() + behind[0]) * 1e9))
+    for jump in (3600.0, -3600.0, 61.0, 119.0, 86_400.0):
+        behind[0] = jump
+        assert client.get("/missions", headers=key).status_code == 429
+
+
+async def test_a_keys_requests_may_come_at_once_and_then_evenly(tmp_path: Path) -> None:
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        await send({"status": 200})
+
+    file, now, statuses = KeyFile(), [1000.0], list[int]()
+    header = (b"authorization", b"Bearer " + file.add("fleet", frozenset({"decide"}), per_minute=6).encode())
+    file.write(tmp_path / "keys.json")
+    guard = KeyAuthentication(app, ApiKeys(tmp_path / "keys.json"), clock=lambda: now[0])
+
+    async def send(message: Any) -> None:
+        statuses.extend([message["status"]] if "status" in message else [])
+
+    async def asked(times: int, after_s: float) -> list[int]:
+        now[0] += after_s
+        statuses.clear()
+        for _ in range(times):
+            await guard({"type": "http", "method": "GET", "path": "/missions", "headers": [header]}, None, send)  # type: ignore[arg-type]
+        return list(statuses)
+
+    assert await asked(8, 0.0) == [200] * 6 + [429] * 2
+    assert await asked(2, 9.9) == [429] * 2
+    assert await asked(2, 0.1) == [200, 429]
+    assert await asked(4, 30.0) == [200] * 3 + [429]
+    assert await asked(8, 3600.0) == [200] * 6 + [429] * 2
+
+
+def test_a_lost_file_of_keys_is_seen(edge: Edge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.api.api_keys._STALE_S", 0.0)
+    path = tmp_path / "keys.json"
+    key = bearer(made(path, fleet=("decide",))["fleet"])
+    client, content = edge(keys=path), path.read_bytes()
+
+    def seen() -> tuple[int, str | None, bool]:
+        ready = client.get("/readyz")
+        lost = "aicvds_keys_lost 1.0" in client.get("/metrics", headers=key).text
+        return ready.status_code, ready.json()["detail"], lost
+
+    said = "the file of keys cannot be read: the previous keys apply"
+    assert seen() == (200, None, False)
+    for lost in (None, b"{", b'{"keys": 3}', b"\xff"):
+        path.unlink() if lost is None else path.write_bytes(lost)
+        assert seen() == (200, said, True)
+        path.write_bytes(content)
+        assert seen() == (200, None, False)
 
 
 def test_a_key_whose_rate_is_lowered_begins_anew(edge: Edge, report: Report, tmp_path: Path) -> None:

@@ -138,5 +138,5 @@ def begun(held: ExitStack, client: httpx.Client, asked: str) -> socket.socket:
     """A request of whose body nothing is sent."""
     address = (client.base_url.host, client.base_url.port or 0)
     connection = held.enter_context(socket.create_connection(address, timeout=PATIENCE_S))
-    connection.sendall(f"{asked} HTTP/1.1\r\nhost: x\r\ncontent-length: 10\r\n\r\n".encode())
+    connection.sendall(f"{asked} HTTP/1.1\r\nhost: localhost\r\ncontent-length: 10\r\n\r\n".encode())
     return connection

@@ -57,7 +57,8 @@ def listed(decided_at: float, newest: str | None, **modes: str | None) -> Answer
 @contextmanager
 def ingress(owners: Replies) -> Iterator[TestClient]:
     ended: list[bool] = []
-    with TestClient(ingress_application(Settings(store="none"), owners, lambda: ended.append(True))) as client:
+    app = ingress_application(Settings(store="none"), owners, lambda: ended.append(True))
+    with TestClient(app, "http://localhost", raise_server_exceptions=False) as client:
         yield client
     assert ended == [True]
 
@@ -177,3 +178,16 @@ def test_a_missions_events_come_from_its_owner(moved: bool) -> None:
                 assert stream.headers["Content-Type"].startswith("text/event-stream")
                 assert [line for line in stream.iter_lines() if line] == ["data: 0 me", "data: 1 me"]
     assert owners.missions == ["m"]
+
+
+@pytest.mark.parametrize("method", ["GET", "POST", "PUT", "DELETE"])
+def test_without_keys_the_ingress_answers_to_this_machines_names_only(method: str) -> None:
+    with ingress(Replies(Answer(200))) as client:
+        for path in ("/decide", "/missions/m", "/healthz"):
+            assert client.request(method, path, headers={"Host": "evil.example"}).status_code == 403
+
+
+def test_a_fault_of_the_ingress_is_a_problem_too() -> None:
+    with ingress(Replies(ValueError("x"))) as client:
+        failed = client.get("/missions/m")
+    assert (failed.status_code, failed.headers["content-type"]) == (500, "application/problem+json")

@@ -53,7 +53,7 @@ def test_those_that_there_are_go_on(tmp_path: Path, report: Callable[..., dict[s
         ]
         assert hung_up(idle[-1])
         # One of those that came before is served still.
-        idle[0].sendall(b"GET /healthz HTTP/1.1\r\nhost: x\r\n\r\n")
+        idle[0].sendall(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n\r\n")
         assert idle[0].recv(65536).startswith(b"HTTP/1.1 200 ")
         for step in range(3):
             kept(uav, report(step=step))

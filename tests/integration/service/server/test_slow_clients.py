@@ -111,7 +111,7 @@ def connected(url: str, *sent: bytes) -> socket.socket:
 
 
 def get(path: str, *headers: str) -> bytes:
-    return "\r\n".join([f"GET {path} HTTP/1.1", "host: x", *headers, "", ""]).encode()
+    return "\r\n".join([f"GET {path} HTTP/1.1", "host: localhost", *headers, "", ""]).encode()
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,7 @@ def test_an_edge_ends_though_its_writer_hangs(tmp_path: Path, report: Report) ->
         writer.suspend()
         assert not httpx.post(f"{url}/decide", json=report(step=1), timeout=PATIENCE_S).json()["stored"]
         process.terminate()
-        assert process.wait(PATIENCE_S) == -signal.SIGTERM
+        assert process.wait(PATIENCE_S) == 0
         writer.resume()
         assert _ended(writer)
 
