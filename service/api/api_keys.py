@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 # `decide`: request decisions, report outcomes, read. `admin`: make, guide and delete missions. `readings`: report what
 # sensors say of themselves.
 Scope = Literal["decide", "admin", "readings"]
+# A mission's ID, or the beginning of IDs and `*`.
+Missions = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\*?$")]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 
 _PREFIX = "aicvds_"
@@ -42,7 +44,7 @@ class BadKeys(Exception):
 
 
 class ApiKey(BaseModel):
-    """One key's record: its name, scopes, requests a minute, and hash."""
+    """One key's record: its name, scopes, requests a minute, hash, and the missions that it is bound to, if it is."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -50,6 +52,13 @@ class ApiKey(BaseModel):
     scopes: frozenset[Scope] = Field(min_length=1)
     per_minute: int = Field(ge=1, le=1_000_000)
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    # Omitted where there is none: earlier edges refuse fields that they do not know.
+    missions: tuple[Missions, ...] | None = Field(None, min_length=1, exclude_if=lambda bound: bound is None)
+
+    def allows(self, mission_id: str) -> bool:
+        """Whether the key may know of a mission."""
+        bound = self.missions or ("*",)
+        return any(mission_id == one or (one[-1] == "*" and mission_id.startswith(one[:-1])) for one in bound)
 
 
 class KeyFile(BaseModel):
@@ -89,14 +98,19 @@ class KeyFile(BaseModel):
         except OSError as error:
             raise BadKeys(f"{path}: {error.strerror or error}") from None
 
-    def add(self, name: str, scopes: frozenset[Scope], per_minute: int) -> str:
-        """Add a key; returns the key itself. Raises ``BadKeys`` for a name in use, or too many keys."""
+    def add(self, name: str, scopes: frozenset[Scope], per_minute: int, missions: tuple[str, ...] | None = None) -> str:
+        """Add a key, by default for all missions; returns the key itself.
+
+        Raises:
+            BadKeys: the name is in use, or there are too many keys.
+        """
         if any(key.name == name for key in self.keys):
             raise BadKeys(f"there is already a key {name}: remove it first, or choose another name")
         if len(self.keys) >= MOST_KEYS:
             raise BadKeys(f"there are already {MOST_KEYS} keys")
         shown = _PREFIX + secrets.token_urlsafe(32)
-        self.keys.append(ApiKey(name=name, scopes=scopes, per_minute=per_minute, sha256=hash_of(shown)))
+        sha256 = hash_of(shown)
+        self.keys.append(ApiKey(name=name, scopes=scopes, per_minute=per_minute, sha256=sha256, missions=missions))
         return shown
 
     def remove(self, name: str) -> None:

@@ -10,7 +10,8 @@ from starlette.types import Scope as AsgiScope
 
 from service.api.api_keys import MOST_KEYS, ApiKey, ApiKeys, Scope
 from service.api.load_limits import READING
-from service.api.problem_details import problem_response
+from service.api.problem_details import problem_response, refusal_of
+from service.errors import NotFound
 from shared.kit.bounded import BoundedDict
 
 # Resources without mission data. Probes of containers and load balancers carry no key.
@@ -18,11 +19,13 @@ _OPEN = frozenset(("/healthz", "/readyz", "/"))
 # The page's scripts and styles; the page requests its data with a key.
 _OPEN_PREFIX = "/static/"
 _ATTENTION = re.compile(r"/missions/[^/]+/attention")
+# The mission of every route below /missions/{id}, so that a new route is bound too.
+_MISSION = re.compile(r"/missions/([^/]+)")
 _READINGS = re.compile(r"/missions/[^/]+/readings")
 _MINUTE_S = 60.0
-# The ASGI scope's entry with the scopes of the request's key.
-SCOPES = "aicvds.scopes"
-# The ASGI scope's entry for streams: a function that returns whether the key is still known.
+# The ASGI scope's entry with the request's key.
+KEY = "aicvds.key"
+# The ASGI scope's entry for streams: a function that returns whether the key is still known, and for this mission.
 STILL_KNOWN = "aicvds.still_known"
 
 
@@ -45,8 +48,9 @@ def is_open(method: str, path: str) -> bool:
 class KeyAuthentication:
     """Pure ASGI middleware: 401 without a known key, 403 without the scope, 429 with ``Retry-After`` past the rate.
 
-    It answers before the body is read. Clients send keys as ``Authorization: Bearer KEY``. A key's requests of a minute
-    may come at once, and then evenly (the generic cell rate algorithm).
+    A mission that the key is not bound to gets 404, whether or not it is there. It answers before the body is read.
+    Clients send keys as ``Authorization: Bearer KEY``. A key's requests of a minute may come at once, and then evenly
+    (the generic cell rate algorithm).
     """
 
     def __init__(self, app: ASGIApp, keys: ApiKeys, clock: Callable[[], float] = time.monotonic) -> None:
@@ -62,7 +66,7 @@ class KeyAuthentication:
             return
         presented = _presented(scope["headers"])
         key = self._keys.find(presented)
-        needed = scope_of(scope["method"], scope["path"])
+        needed, mission = scope_of(scope["method"], scope["path"]), _MISSION.match(scope["path"])
         if key is None:
             refusal = problem_response(401, "send a known key as `Authorization: Bearer KEY`")
             refusal.headers["WWW-Authenticate"] = "Bearer"
@@ -71,9 +75,13 @@ class KeyAuthentication:
         elif (wait_s := self._wait(key)) is not None:
             refusal = problem_response(429, f"key {key.name} has a limit of {key.per_minute} requests a minute")
             refusal.headers["Retry-After"] = str(wait_s)
+        elif mission is not None and not key.allows(mission[1]):
+            refusal = refusal_of(no_mission(mission[1]))
         else:
-            scope[SCOPES] = key.scopes
-            scope[STILL_KNOWN] = lambda: self._keys.find(presented) is not None
+            scope[KEY] = key
+            scope[STILL_KNOWN] = lambda: (
+                (now := self._keys.find(presented)) is not None and (mission is None or now.allows(mission[1]))
+            )
             await self.app(scope, receive, send)
             return
         # The connection is closed, so that the server does not wait for the rest of the request.
@@ -89,6 +97,11 @@ class KeyAuthentication:
             return math.ceil(wait_s)
         self._even_end_s[key.name, key.per_minute] = ends
         return None
+
+
+def no_mission(mission_id: str) -> NotFound:
+    """The refusal of a mission that the request's key is not bound to."""
+    return NotFound("mission_id", f"there is no mission {mission_id}")
 
 
 def _presented(headers: Sequence[tuple[bytes, bytes]]) -> str:

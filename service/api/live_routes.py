@@ -16,7 +16,7 @@ from starlette.types import Message, Scope, Send
 from service import live
 from service.api.authentication import STILL_KNOWN
 from service.api.problem_details import documented
-from service.api.routes import TheEngine, may_command
+from service.api.routes import TheEngine, may_command, may_know
 from service.errors import NotFound
 from service.live.broadcaster import Broadcaster
 from shared.wire.missions import DecisionPrompt, MissionLine, MissionList
@@ -115,7 +115,8 @@ async def list_missions(engine: TheEngine, request: Request) -> MissionList:
     missions = engine.missions
     loaded = {mission.mission_id: mission for mission in missions.loaded}
     lately = [name for name in engine.live.history.missions() if name in loaded]
-    names = list(dict.fromkeys((*lately, *reversed(loaded), *missions.stored)))
+    known = dict.fromkeys((*lately, *reversed(loaded), *missions.stored))
+    names = [name for name in known if may_know(request, name)]
     lines = []
     for name in names[:_MOST_LISTED]:
         mission = loaded.get(name)
@@ -126,7 +127,7 @@ async def list_missions(engine: TheEngine, request: Request) -> MissionList:
     return MissionList(
         missions=lines,
         more=max(0, len(names) - _MOST_LISTED),
-        newest=lately[0] if lately else None,
+        newest=names[0] if names and names[0] in lately else None,
         may_command=may_command(request),
     )
 

@@ -71,8 +71,10 @@ def _add_security(operation: dict[str, Any], method: str, path: str) -> None:
     if is_open(method, path):
         return
     operation["security"] = [{"key": []}, {}]
-    statuses = (401, 403, 429) if scope_of(method, path) else (401, 429)
-    responses = operation["responses"] | {str(s): response for s, response in documented(*statuses).items()}
+    refusals = [403] if scope_of(method, path) else []
+    # A key that is bound to other missions.
+    refusals += [404] if path.startswith("/missions/") else []
+    responses = operation["responses"] | {str(s): one for s, one in documented(401, 429, *refusals).items()}
     operation["responses"] = dict(sorted(responses.items()))
 
 

@@ -49,6 +49,11 @@ def problem_response(
     return Response(body.model_dump_json(), status_code=status, media_type=CONTENT_TYPE)
 
 
+def refusal_of(error: Refused) -> Response:
+    """The problem of a refusal."""
+    return problem_response(error.status, str(error), [{"field": error.field, "problem": error.detail}], error.type)
+
+
 def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """OpenAPI entries for the problems of a route."""
     # Each status needs its own dicts, because its example is added to them.
@@ -66,10 +71,9 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(Refused)
     async def refused(request: Request, error: Refused) -> Response:
-        faults = [{"field": error.field, "problem": error.detail}]
         if isinstance(error, Misdirected):
-            return _misdirected(request, error, faults)
-        response = problem_response(error.status, str(error), faults, error.type)
+            return _misdirected(request, error)
+        response = refusal_of(error)
         if isinstance(error, Unavailable):
             response.headers["Retry-After"] = str(_RETRY_S)
         return response
@@ -96,8 +100,9 @@ def install(app: FastAPI) -> None:
         return problem_response(500, "the edge failed; its log has the details")
 
 
-def _misdirected(request: Request, error: Misdirected, faults: Sequence[dict[str, str]]) -> Response:
+def _misdirected(request: Request, error: Misdirected) -> Response:
     """A 421 with the request's address at the owner, and the seconds after which any edge may take the mission over."""
+    faults = [{"field": error.field, "problem": error.detail}]
     response = problem_response(error.status, str(error), faults, error.type, error.owner)
     if error.owner is not None:
         query = f"?{request.url.query}" if request.url.query else ""

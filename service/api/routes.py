@@ -3,6 +3,7 @@
 import asyncio
 import re
 from collections.abc import Callable, Coroutine
+from functools import partial
 from operator import attrgetter
 from typing import Annotated, Any
 
@@ -12,8 +13,8 @@ from fastapi.routing import APIRoute
 from pydantic import ValidationError
 
 from service.api import attention_weights
-from service.api.api_keys import ApiKeys, Scope
-from service.api.authentication import SCOPES
+from service.api.api_keys import ApiKey, ApiKeys
+from service.api.authentication import KEY, no_mission
 from service.api.problem_details import documented
 from service.edge.engine import Engine
 from service.llm.server_pool import ServerPool
@@ -78,8 +79,19 @@ async def _engine(request: Request) -> Engine:
 
 def may_command(request: Request) -> bool:
     """Whether the request may make, guide and delete missions: with keys, only scope ``admin`` may."""
-    scopes: frozenset[Scope] | None = request.scope.get(SCOPES)
-    return scopes is None or "admin" in scopes
+    key: ApiKey | None = request.scope.get(KEY)
+    return key is None or "admin" in key.scopes
+
+
+def may_know(request: Request, mission_id: str) -> bool:
+    """Whether the request's key is for a mission; for any other the answer is that there is none."""
+    key: ApiKey | None = request.scope.get(KEY)
+    return key is None or key.allows(mission_id)
+
+
+def _refuse_unless_bound(request: Request, mission_id: str) -> None:
+    if not may_know(request, mission_id):
+        raise no_mission(mission_id)
 
 
 def _keys_lost(request: Request) -> bool:
@@ -109,6 +121,7 @@ KnownTags = Annotated[str | None, Header(alias="If-None-Match", max_length=1000,
 )
 async def decide(body: DecideRequest, request: Request, key: RequestKey = None) -> Response:
     """The sensor to collect from, and the velocity of the next step."""
+    _refuse_unless_bound(request, body.mission_id)
     engine: Engine = request.state.engine
     answer = await engine.decide(body, may_make=may_command(request), key=key)
     timing = {"Server-Timing": ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())}
@@ -121,13 +134,16 @@ async def decide_batch(
     body: BatchRequest, request: Request, engine: TheEngine, key: RequestKey = None
 ) -> BatchResponse:
     """A fleet's UAVs at one step, decided in the order given; no sensor is given to two of them."""
+    _refuse_unless_bound(request, body.mission_id)
     return BatchResponse(decisions=await engine.decide_batch(body, may_make=may_command(request), key=key))
 
 
 @router.post("/feedback", responses=documented(400, 404, 408, 409, 413, 415, 421, 422, 503), tags=["decisions"])
-async def feedback(body: FeedbackRequest, engine: TheEngine) -> FeedbackResponse:
+async def feedback(body: FeedbackRequest, request: Request, engine: TheEngine) -> FeedbackResponse:
     """A decision's outcome. A repeated outcome is applied once; an acknowledged outcome is on disk."""
-    return await engine.feedback(body)
+    if body.mission_id is not None:
+        _refuse_unless_bound(request, body.mission_id)
+    return await engine.feedback(body, partial(may_know, request))
 
 
 @router.put("/missions/{mission_id}", responses=documented(400, 408, 409, 413, 415, 421, 422, 503), tags=["missions"])

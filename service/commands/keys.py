@@ -18,7 +18,7 @@ from shared.kit.validation_messages import problem_of
 class Add:
     """Make a key and show it once; the file has only its hash.
 
-    Try it:  aicvds keys add fleet-1 --file keys.json --scopes decide admin
+    Try it:  aicvds keys add fleet-1 --file keys.json --scopes decide admin --missions 'north-*'
     """
 
     name: Annotated[str, tyro.conf.Positional]
@@ -28,13 +28,16 @@ class Add:
     scopes: tuple[Scope, ...] = ("decide",)
     """decide: request decisions and report outcomes. admin: make, guide and delete missions. A simulator needs both.
     readings: report what sensors say of themselves, as `aicvds mqtt` does."""
+    missions: tuple[str, ...] | None = None
+    """The missions that the key may know of: IDs, and beginnings of IDs such as 'north-*'. For it there are no others.
+    Default: all missions."""
     per_minute: int = 6000
     """Requests a minute; more are refused with 429 and Retry-After."""
 
 
 @dataclass(frozen=True)
 class List:
-    """Show the keys' names, scopes and limits."""
+    """Show the keys' names, scopes, limits and missions."""
 
     file: Path
     """The file of keys."""
@@ -69,13 +72,14 @@ def main(argv: list[str]) -> int:
         match command:
             case Add():
                 with editing(command.file) as known:
-                    shown = known.add(command.name, frozenset(command.scopes), command.per_minute)
+                    shown = known.add(command.name, frozenset(command.scopes), command.per_minute, command.missions)
                 print(f"Key {command.name}, shown this once; send it as `Authorization: Bearer KEY`:", file=sys.stderr)
                 print(shown)
             case List():
-                table = Table("name", "scopes", "a minute")
+                table = Table("name", "scopes", "a minute", "missions")
                 for key in KeyFile.read(command.file).keys:
-                    table.add_row(key.name, " ".join(sorted(key.scopes)), str(key.per_minute))
+                    missions = " ".join(key.missions or ("all",))
+                    table.add_row(key.name, " ".join(sorted(key.scopes)), str(key.per_minute), missions)
                 Console().print(table)
             case Remove():
                 with editing(command.file) as known:

@@ -119,8 +119,13 @@ class Engine:
 
         return await self._respond(mission, request, key, make, deadline)
 
-    async def feedback(self, request: FeedbackRequest) -> FeedbackResponse:
+    async def feedback(
+        self, request: FeedbackRequest, may_know: Callable[[str], bool] = lambda _: True
+    ) -> FeedbackResponse:
         """Apply an outcome once; an acknowledged outcome is on disk.
+
+        Args:
+            may_know: whether a mission may be looked at for the decision of a request without a mission.
 
         Raises:
             NotFound: an unknown mission or decision.
@@ -128,7 +133,7 @@ class Engine:
             Unavailable: the store fails, or is slow; the client is to send the outcome again.
         """
         if request.mission_id is None:
-            mission = await self.missions.of_decision(request.decision_id)
+            mission = await self.missions.of_decision(request.decision_id, may_know)
         else:
             mission = await self.missions.get(request.mission_id)
         self.missions.refuse_if_failing("decision_id")

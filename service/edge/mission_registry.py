@@ -82,17 +82,21 @@ class MissionRegistry:
             raise NotFound("mission_id", f"there is no mission {mission_id}")
         return mission
 
-    async def of_decision(self, decision_id: str) -> Mission:
+    async def of_decision(self, decision_id: str, may_know: Callable[[str], bool]) -> Mission:
         """The mission that knows the decision: one in memory, or mission ``default`` from the store.
+
+        Args:
+            may_know: whether a mission may be looked at.
 
         Raises:
             NotFound: no mission knows it; the decision may belong to another mission that is only in the store.
             Misdirected, Unavailable, Conflict: as :meth:`get`.
         """
         for mission in self.loaded:
-            if mission.pending.knows(decision_id):
+            if may_know(mission.mission_id) and mission.pending.knows(decision_id):
                 return await self.get(mission.mission_id)
-        if "default" in self._listed and (mission := await self.get("default")).pending.knows(decision_id):
+        listed = "default" in self._listed and may_know("default")
+        if listed and (mission := await self.get("default")).pending.knows(decision_id):
             return mission
         detail = f"no mission in memory knows decision {decision_id}, or it is forgotten; name its mission_id"
         raise NotFound("decision_id", detail)

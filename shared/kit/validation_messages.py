@@ -22,6 +22,7 @@ _PLAIN = {
 # The words for the patterns of fields.
 _PATTERNS = {
     r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$": "1 to 64 letters, digits, `.`, `_` and `-`, with a letter or digit first",
+    r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\*?$": "a mission's ID, or the beginning of IDs and `*`",
     r"^[A-Za-z0-9_.-]{1,64}$": "1 to 64 letters, digits, `_`, `.` and `-`",
     r"^[0-9A-Za-z_-]{1,64}$": "1 to 64 letters, digits, `_` and `-`",
     r"^[A-Za-z0-9-]{1,64}$": "1 to 64 letters, digits and `-`",

@@ -31,8 +31,8 @@ def test_a_foreign_name_is_refused_whatever_the_method(edge: Edge, report: Repor
     client = edge()
     assert client.put("/missions/m", json={}).status_code == 200
     routes = """PUT /missions/m, DELETE /missions/m, POST /decide, POST /missions/m/guidance, GET /missions,
-    GET /missions/m, GET /missions/m/events, GET /, HEAD /, GET /healthz, GET /static/main.js, GET /missions/, GET /metrics,
-    TRACE /, PATCH /missions/m, OPTIONS /decide, GET /nowhere, GET /openapi.json"""
+    GET /missions/m, GET /missions/m/events, GET /, HEAD /, GET /healthz, GET /static/main.js, GET /missions/,
+    GET /metrics, TRACE /, PATCH /missions/m, OPTIONS /decide, GET /nowhere, GET /openapi.json"""
     for method, path in (route.split() for route in routes.split(",")):
         answer = client.request(method, path, json=report(), headers={"Host": host})
         assert (answer.status_code, answer.headers["content-type"]) == (403, "application/problem+json"), path

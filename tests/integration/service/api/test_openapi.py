@@ -53,7 +53,7 @@ def test_what_is_asked_for_a_key_says_so() -> None:
         for method, path in OPERATIONS
     }
     assert refusals["get /healthz"] == refusals["get /readyz"] == []
-    # Any key may read; deciding, and making missions, takes a scope.
+    # Any key may read, where it is bound to the mission; deciding, and making missions, takes a scope.
     assert refusals["get /missions/{mission_id}"] == ["401", "429"]
     assert refusals["post /decide"] == refusals["put /missions/{mission_id}"] == ["401", "403", "429"]
     asking = {f"{method} {path}" for method, path in OPERATIONS if "security" in DOCUMENT["paths"][path][method]}
