@@ -54,7 +54,9 @@ def look_ahead_among(state: AttendedState) -> Action:
 
 
 class EdgeFleet:
-    """A fleet with one mission of the service, decided by ``decider``."""
+    """A fleet with one mission of the service, decided by ``decider``; ``state`` is that of the last decision."""
+
+    state: AttendedState
 
     def __init__(self, decider: EdgeDecider, scenario: Scenario, seed: int) -> None:
         mode = "value" if decider.by == "value" else "policy"
@@ -79,7 +81,7 @@ class EdgeFleet:
             if sample is not None and self._learns:
                 learned.append((sample, cost))
         self._observe(request)
-        state = AttendedState.of(mission, request, request.step)
+        self.state = state = AttendedState.of(mission, request, request.step)
         by_value = self._decider.by == "value" and state.rows
         action = state.best_by_value() if by_value else look_ahead_among(state)
         if action.sensor_id in state.reserved:

@@ -23,7 +23,7 @@ _VIEW = {"features": "paper", "belief": "reported"}
 KEPT = (3, 5, 7)
 STARTS = {"shipped": "pretrained", "random": "random"}
 FORMULAS = ("eof", "wqcs")
-LEARNED = ("madqn", "mappo")
+LEARNED = ("madqn_paper", "mappo", "madqn")
 
 
 def chooser_name(start: str, k: int) -> str:

@@ -23,7 +23,7 @@ from simulator.commands.running import command_main
 from simulator.errors import UsageError
 
 SEEDS, LLM_SEEDS = 30, 10
-PAGE, MAP = "page", "claims-map"
+PAGE, MAP, FIGURES = "page", "claims-map", "paper-figures"
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,8 @@ class ExperimentOptions:
     All results beside the paper's numbers, as a page:  python -m lab experiment {PAGE} --help
 
     Where the paper's claims hold, a map over its open numbers:  python -m lab experiment {MAP} --help
+
+    The paper's figures as it draws them:  python -m lab experiment {FIGURES} --help
 
     Exit code: 0 made, 1 an edge or its LLM failed, 2 bad use, 130 interrupted.
     """
@@ -91,6 +93,10 @@ def main(argv: list[str]) -> int:
         from lab.claims_map import command
 
         return command.main(argv[1:])
+    if argv[:1] == [FIGURES]:
+        from lab.paper_figures import command as drawn
+
+        return drawn.main(argv[1:])
     return command_main(
         ExperimentOptions, "python -m lab experiment", argv, lambda options, console: experiment(options, argv, console)
     )
