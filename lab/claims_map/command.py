@@ -21,7 +21,7 @@ SEEDS, QUICK_SEEDS = 30, 2
 class MapOptions:
     """Map where the paper's claims hold: 52 settings of arrivals, initial queues, step, threshold and link share.
 
-    Every setting is flown by the paper's EOF and WQCS, MADQN and MAPPO with the shipped weights, mode `value`, and one
+    Every setting is flown by the paper's EOF and WQCS, the paper's MADQN, ours, and MAPPO with the shipped weights, mode `value`, and one
     step of look-ahead in the LLM's place behind attention (k of 3, 5, 7 and all sensors; from the shipped and from a
     random start). One process takes an hour or two. Each scheme's flights at a setting are a file of --out, and the
     same command continues after Ctrl-C or a crash. Written to --out: claims-map.csv (a line a setting and claim),

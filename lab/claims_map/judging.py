@@ -24,7 +24,7 @@ from simulator.records.statistics import jain_index
 WINDOW, LEAST_REMAINING = 5, 3
 # The paper's initial transient, steps 0 to 3.
 TRANSIENT_STEPS = 4
-BASELINES = ("eof", "wqcs", "madqn", "mappo")
+BASELINES = ("eof", "wqcs", "madqn_paper", "mappo")
 # By the letter that stands for it in the figure.
 STAND_INS = {"r": chooser_name("random", 5), "s": chooser_name("shipped", 5), "v": "value"}
 Flights = Mapping[str, Flown]
@@ -110,7 +110,7 @@ def _zero_near(names: Sequence[str], stated: int, flights: Flights) -> Held:
 
 def _first(flights: Flights) -> Held:
     ours = {letter: settled_step(flights[name]) for letter, name in STAND_INS.items()}
-    theirs = [settled_step(flights[name]) for name in ("eof", "wqcs", "madqn")]
+    theirs = [settled_step(flights[name]) for name in BASELINES[:3]]
     soonest = min((step for step in theirs if step is not None), default=None)
     held = {n: s is not None and (soonest is None or s < soonest) for n, s in ours.items()}
     return Held(held, f"{_steps(ours)}; EOF, WQCS, MADQN: {', '.join(map(_at, theirs))}")
@@ -188,7 +188,7 @@ CLAIMS: tuple[MapClaim, ...] = (
     MapClaim(
         "madqn_at_27",
         f"MADQN reaches zero\nonly by step {MADQN_ZERO_AT} (±{NEAR_STEPS})",
-        partial(_zero_near, ("madqn",), MADQN_ZERO_AT),
+        partial(_zero_near, ("madqn_paper",), MADQN_ZERO_AT),
     ),
     MapClaim("first", "AIC-VDS is at zero before\nEOF, WQCS and MADQN", _first),
     MapClaim("fewest", "AIC-VDS loses less than\neach of the four baselines", _fewest),

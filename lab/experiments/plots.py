@@ -43,6 +43,7 @@ LOOKS: dict[str, Style] = {
     "longest_queue_fast": (ORANGE, (0, (1, 1)), "p"),
     "queue_and_channel_fast": (GREEN, "-.", "<"),
     "madqn": (RED, "-", "P"),
+    "madqn_paper": (RED, "--", "P"),
     "mappo": (PURPLE, "-", "*"),
     "bound": (INK, (0, (4, 2)), "|"),
     "llm": (BLUE, "-", "o"),

@@ -82,6 +82,7 @@ PLANNERS = (PLANNER, FORMULA_PLANNER)
 # In display order. A figure shows those that are policies of this version.
 _POLICY_LABELS = {
     "madqn": "MADQN",
+    "madqn_paper": "MADQN, the paper's",
     "mappo": "MAPPO",
     PLANNER: "MPC (horizon 8)",
     FORMULA_PLANNER: "MPC without learning",
@@ -96,7 +97,7 @@ _POLICY_LABELS = {
     "round_robin": "round robin",
     "random": "random",
 }
-_OF_THE_LAB = {name: f"lab.marl.learned:{name}" for name in ("madqn", "mappo")}
+_OF_THE_LAB = {name: f"lab.marl.learned:{name}" for name in ("madqn", "madqn_paper", "mappo")}
 _OF_THE_LAB[FORMULA_PLANNER] = "lab.experiments.formula_planner:FormulaPlanner"
 # Only the experiments that name them fly these.
 _NAMED_ONLY = (FORMULA_PLANNER,)

@@ -59,3 +59,8 @@ def madqn() -> Learned:
 def mappo() -> Learned:
     """MAPPO with the weights that ship: ``--policy lab.marl.learned:mappo``."""
     return Learned("mappo")
+
+
+def madqn_paper() -> Learned:
+    """The paper's MADQN with the weights that ship: ``--policy lab.marl.learned:madqn_paper``."""
+    return Learned("madqn_paper")

@@ -31,7 +31,7 @@ AS_THE_PAPER_SAYS = flights(
     **dict.fromkeys((*OURS, "look_ahead_random_k7", "look_ahead_shipped_k7", "look_ahead_all"), [9, 9, 9, 9]),
     eof=[1] * 20,
     wqcs=[1] * 18,
-    madqn=[2] * 25,
+    madqn_paper=[2] * 25,
     mappo=[2] * 30,
     look_ahead_random_k3=[9] * 8,
     look_ahead_shipped_k3=[9] * 8,
