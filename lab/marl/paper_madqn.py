@@ -154,7 +154,7 @@ class PaperMadqn:
                 target = batch["reward"] + DISCOUNT * (1.0 - batch["done"]) * coming
             loss = nn.functional.smooth_l1_loss(value, target)
             optimiser.zero_grad()
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
             total += float(loss.detach())
         self._iterations += 1
@@ -181,7 +181,7 @@ class PaperMadqn:
         self._next_seed, self._explored, self._iterations = (state[n] for n in ("next_seed", "explored", "iterations"))
         self._online.load_state_dict(state["online"])
         self._target.load_state_dict(state["target"])
-        for own, saved in zip(
-            (*self._optimisers, *self._replays), (*state["optimisers"], *state["replays"]), strict=True
-        ):
-            own.load_state_dict(saved)
+        for optimiser, saved in zip(self._optimisers, state["optimisers"], strict=True):
+            optimiser.load_state_dict(saved)
+        for replay, saved in zip(self._replays, state["replays"], strict=True):
+            replay.load_state_dict(saved)

@@ -142,9 +142,9 @@ def circles(folder: Folder, name: str, scenario: Scenario, trips: Sequence[Trips
 def _circle(picture: Figure, panel: Axes, trip: Trips, centre: tuple[float, float], radius_m: float) -> None:
     turn = np.linspace(0, 2 * np.pi, 200)
     panel.plot(centre[0] + radius_m * np.cos(turn), centre[1] + radius_m * np.sin(turn), color="#cccccc", lw=0.8)
-    shown = panel.scatter(*trip.places.T, c=trip.milliseconds, cmap="viridis", s=16, zorder=2)
-    for place, marker, label in ((trip.places[0], "^", "start"), (trip.places[-1], "s", "end")):
-        panel.scatter(*place, marker=marker, s=60, facecolor="none", edgecolor=RED, label=label, zorder=3)
+    shown = panel.scatter(trip.places[:, 0], trip.places[:, 1], c=trip.milliseconds, cmap="viridis", s=16, zorder=2)
+    for (x, y), marker, label in ((trip.places[0], "^", "start"), (trip.places[-1], "s", "end")):
+        panel.scatter(x, y, marker=marker, s=60, facecolor="none", edgecolor=RED, label=label, zorder=3)
     picture.colorbar(shown, ax=panel, orientation="horizontal", label="round trip, ms")
     panel.set_title(f"UAV {trip.uav}")
     panel.set_aspect("equal")
