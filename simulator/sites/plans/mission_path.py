@@ -11,29 +11,10 @@ from shared.world.scenario import Point
 
 # MAV_CMD numbers, https://mavlink.io/en/messages/common.html
 WAYPOINT, RETURN_TO_LAUNCH, LAND, TAKEOFF, JUMP = 16, 20, 21, 22, 177
-_VTOL_TAKEOFF, _VTOL_LAND, DELAY, _LAND_START = 84, 85, 93, 189
-# Commands up to this number make the vehicle fly somewhere.
+_VTOL_TAKEOFF, _VTOL_LAND, DELAY = 84, 85, 93
+# Commands up to this number make the vehicle fly somewhere; the ones above change speed, camera and the like.
 _LAST_NAVIGATION = 95
 _STARTS, _ENDS, _STAYS = {TAKEOFF, _VTOL_TAKEOFF}, {RETURN_TO_LAUNCH, LAND, _VTOL_LAND}, {DELAY}
-# Commands that leave the path as it is. Any other may change it, such as DO_JUMP_TAG.
-_LEAVES_PATH = {
-    "condition": {112, 114, 115},
-    "speed": {178},
-    "home": {179},
-    "relay or servo": {181, 182, 183, 184},
-    "camera or gimbal": {195, 196, 197, 200, 201, 202, 203, 204, 205, 206, 214, 220, 1000, 1001}
-    | {530, 531, 532, 533, 534, 2000, 2001, 2003, 2500, 2501, 2502, 2503},
-    "geofence switch": {207},
-    "payload": {211, 216, 42600},
-    "autotune, script, auxiliary function or engine": {212, 217, 218, 223},
-    "jump tag": {600},
-    "transition": {3000},
-}
-_PASSED_OVER = {"take-off": _STARTS, "landing": _ENDS | {_LAND_START}, "delay": _STAYS} | _LEAVES_PATH
-_HARMLESS = frozenset().union(*_LEAVES_PATH.values())
-# MAV_FRAME numbers of latitudes and longitudes, by what their heights are above.
-_ABOVE = {0: "mean sea level", 5: "mean sea level", 3: "take-off", 6: "take-off", 10: "the terrain", 11: "the terrain"}
-RELATIVE = {frame for frame, above in _ABOVE.items() if above == "take-off"}
 # The repeats of a jump without an end. MAVLink's is -1, but PX4 stores the number as uint16 (mavlink_mission.cpp), and
 # C++ leaves open what becomes of -1. ArduPilot, which stores it as int16, keeps this number, too.
 FOREVER = 32767
@@ -64,14 +45,6 @@ class MissionItem:
     height_m: float | None = None
 
 
-def item_of(where: str, number: int, command: int, frame: int, parameters: Sequence[float | None]) -> MissionItem:
-    """The item of the seven parameters that files write."""
-    first, second, _, _, latitude, longitude, height = parameters
-    position = None if latitude is None or longitude is None else (longitude, latitude)
-    relative = height if frame in RELATIVE else None
-    return MissionItem(where, number, command, position, relative, (first or 0.0, second or 0.0), frame, height)
-
-
 @dataclass(frozen=True)
 class MissionPath:
     """The straight legs that a mission's waypoints make.
@@ -95,6 +68,36 @@ class MissionPath:
         if rest == rest[::-1]:
             return (first, *rest[: (len(rest) + 1) // 2])
         return (first, *rest, first)
+
+
+# Begins a landing: the items to the next landing are its approach.
+_LAND_START = 189
+# Commands that leave the path as it is. Any other may change it, such as DO_JUMP_TAG.
+_LEAVES_PATH = {
+    "condition": {112, 114, 115},
+    "speed": {178},
+    "home": {179},
+    "relay or servo": {181, 182, 183, 184},
+    "camera or gimbal": {195, 196, 197, 214, 220, 1000, 1001, 2000, 2001, 2003, 2500, 2501, 2502, 2503}
+    | {*range(200, 207), *range(530, 535)},
+    "geofence switch": {207},
+    "payload": {211, 216, 42600},
+    "autotune, script, auxiliary function or engine": {212, 217, 218, 223},
+    "jump tag": {600},
+    "transition": {3000},
+}
+_PASSED_OVER = {"take-off": _STARTS, "landing": _ENDS | {_LAND_START}, "delay": _STAYS} | _LEAVES_PATH
+_HARMLESS = frozenset().union(*_LEAVES_PATH.values())
+# MAV_FRAME numbers of latitudes and longitudes, by what their heights are above.
+_ABOVE = {0: "mean sea level", 5: "mean sea level", 3: "take-off", 6: "take-off", 10: "the terrain", 11: "the terrain"}
+
+
+def item_of(where: str, number: int, command: int, frame: int, parameters: Sequence[float | None]) -> MissionItem:
+    """The item of the seven parameters that files write."""
+    first, second, _, _, latitude, longitude, height = parameters
+    position = None if latitude is None or longitude is None else (longitude, latitude)
+    relative = height if _ABOVE.get(frame) == "take-off" else None
+    return MissionItem(where, number, command, position, relative, (first or 0.0, second or 0.0), frame, height)
 
 
 def path_of(items: Sequence[MissionItem]) -> MissionPath:
@@ -145,32 +148,6 @@ def repeats_forever(jump: MissionItem) -> bool:
     return jump.parameters[1] < 0 or jump.parameters[1] >= FOREVER
 
 
-def notes_on(items: Sequence[MissionItem]) -> list[str]:
-    """What the items have and a world's trajectory has not, a sentence each."""
-    notes = []
-    kinds = {kind: sum(item.command in commands for item in items) for kind, commands in _PASSED_OVER.items()}
-    if any(kinds.values()):
-        passed = ", ".join(f"{kind} ({count})" for kind, count in kinds.items() if count)
-        notes.append(f"passed over, for they are not the path's: {passed}.")
-    waypoints = [item for item in items if item.command == WAYPOINT]
-    if waits := [item for item in waypoints if item.parameters[0] > 0]:
-        notes.append(f"waits at {len(waits)} waypoints, the first at {waits[0].where}; a world's UAVs fly on.")
-    jump = next((item for item in items if item.command == JUMP), None)
-    if jump is not None and not repeats_forever(jump):
-        notes.append(f"flies {jump.parameters[1] + 1:g} laps; a world's UAVs fly on.")
-    heights: dict[str, list[float]] = {}
-    for item in waypoints:
-        if item.height_m is not None:
-            heights.setdefault(_ABOVE[item.frame], []).append(item.height_m)
-    if heights:
-        ranges = (
-            f"{min(of):g}{f' to {max(of):g}' if max(of) > min(of) else ''} m above {above}"
-            for above, of in heights.items()
-        )
-        notes.append(f"waypoints at {' and at '.join(ranges)}; a world has one height: altitude_m in scenario.toml.")
-    return notes
-
-
 def items_of(trajectory: Sequence[Point], altitude_m: float) -> list[MissionItem]:
     """The items that fly a trajectory again and again: take-off, the waypoints, a jump to the first of them.
 
@@ -185,6 +162,34 @@ def items_of(trajectory: Sequence[Point], altitude_m: float) -> list[MissionItem
         items.append(MissionItem(f"waypoint {number - 2}", number, WAYPOINT, position, altitude_m))
     items.append(MissionItem("jump", len(items) + 1, JUMP, parameters=(2.0, float(FOREVER))))
     return items
+
+
+def notes_on(items: Sequence[MissionItem]) -> list[str]:
+    """What the items have and a world's trajectory has not, a sentence each."""
+    notes = []
+    kinds = {kind: sum(item.command in commands for item in items) for kind, commands in _PASSED_OVER.items()}
+    if any(kinds.values()):
+        passed = ", ".join(f"{kind} ({count})" for kind, count in kinds.items() if count)
+        notes.append(f"passed over, for they are not the path's: {passed}.")
+    waypoints = [item for item in items if item.command == WAYPOINT]
+    if waits := [item for item in waypoints if item.parameters[0] > 0]:
+        notes.append(f"waits at {len(waits)} waypoints, the first at {waits[0].where}; a world's UAVs fly on.")
+    jump = next((item for item in items if item.command == JUMP), None)
+    if jump is not None and jump.parameters[1] > 0 and not repeats_forever(jump):
+        notes.append(f"flies {jump.parameters[1] + 1:g} laps; a world's UAVs fly on.")
+    elif jump is not None and (unreached := items[items.index(jump) + 1 :]):
+        notes.append(f"{len(unreached)} items from {unreached[0].where} on are never reached, after an endless jump.")
+    heights: dict[str, list[float]] = {}
+    for item in waypoints:
+        if item.height_m is not None:
+            heights.setdefault(_ABOVE.get(item.frame, "something else"), []).append(item.height_m)
+    if heights:
+        ranges = (
+            f"{min(of):g}{f' to {max(of):g}' if max(of) > min(of) else ''} m above {above}"
+            for above, of in heights.items()
+        )
+        notes.append(f"waypoints at {' and at '.join(ranges)}; a world has one height: altitude_m in scenario.toml.")
+    return notes
 
 
 def _position(item: MissionItem) -> Point:

@@ -226,8 +226,10 @@ def test_maps_are_told_what_to_do(tmp_path: Path, name: str, complaint: str) -> 
 
 
 def test_what_no_vehicle_reaches_may_follow_a_jump(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.plan", plan(TAKE_OFF, *TRIANGLE, AGAIN, waypoint(*A, 6), item(21)))
-    assert read_plan(path).path.repeats
+    beyond = waypoint(*A, 6) | {"frame": 1}
+    read = read_plan(write(tmp_path / "a.plan", plan(TAKE_OFF, *TRIANGLE, AGAIN, beyond, item(21))))
+    assert read.path.repeats
+    assert "2 items from mission.items[5] on are never reached, after an endless jump." in read.notes
     path = write(tmp_path / "a.plan", plan(TAKE_OFF, *TRIANGLE, item(177, 2, 3), item(206), item(20)))
     assert read_plan(path).path.repeats
 
