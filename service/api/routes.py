@@ -229,17 +229,17 @@ async def readyz(request: Request, response: Response) -> Readiness:
     """Whether the edge can decide: by the policy immediately, by the LLM when ``llm`` is ``ready``.
 
     An edge is not ready (503) if it cannot reach the PostgreSQL that it shares with other edges, or if its SQLite file
-    was deleted or replaced.
+    was deleted, replaced, damaged or changed by another program; ``detail`` has the reason.
     """
     llm: ServerPool = request.state.llm
     engine: Engine = request.state.engine
     readiness = llm.readiness()
     if _keys_lost(request):
         readiness = readiness.model_copy(update={"detail": "the file of keys cannot be read: the previous keys apply"})
-    if engine.missions.intact:
+    if (fault := engine.missions.fault) is None:
         return readiness
     response.status_code = 503
-    return readiness.model_copy(update={"ready": False, "detail": "the store cannot be reached"})
+    return readiness.model_copy(update={"ready": False, "detail": fault})
 
 
 @router.get("/metrics", tags=["operation"], response_class=Response)

@@ -64,9 +64,9 @@ class MissionRegistry:
         return sorted(self._listed)
 
     @property
-    def intact(self) -> bool:
-        """Whether this edge can own missions: it can renew leases, and its SQLite file still exists."""
-        return self._ownership.intact and not self._journal.replaced
+    def fault(self) -> str | None:
+        """Why this edge can own no missions until someone acts: its SQLite file, or leases that it cannot renew."""
+        return self._journal.fault if self._ownership.intact else "the store cannot be reached"
 
     async def get(self, mission_id: str) -> Mission:
         """The mission, loaded from the store where it is not in memory.

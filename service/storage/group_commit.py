@@ -18,9 +18,8 @@ from itertools import islice
 from service.observability.metrics import Metrics
 from service.storage.leases import LeaseLost
 from service.storage.operations import Change, Checkpoint, Entry
-from service.storage.sqlite_process import REPLACED
 from service.storage.store import cause
-from service.storage.writer import Writer
+from service.storage.writer import WriteFailed, Writer
 
 log = logging.getLogger(__name__)
 
@@ -77,6 +76,8 @@ class GroupCommit:
         self._pause_s = _FIRST_PAUSE_S
         # Why the last transaction failed, if it did.
         self._failure: str | None = None
+        # Whether it will fail until someone acts.
+        self._lasting = False
         # Requests that wait: the ticket that each needs, and whether it was reached.
         self._requests: list[tuple[int, asyncio.Future[bool]]] = []
         # Made by `close`; done once the state is CLOSED, cancelled where `close` ran out of time.
@@ -88,9 +89,9 @@ class GroupCommit:
         return self._failure is not None
 
     @property
-    def replaced(self) -> bool:
-        """Whether the last transaction failed because a file of the store was deleted or replaced."""
-        return self._failure is not None and REPLACED in self._failure
+    def fault(self) -> str | None:
+        """Why every transaction will fail until someone acts; None if there is no such reason."""
+        return self._failure if self._lasting else None
 
     def add(self, change: Change) -> None:
         """Queue a change behind all others."""
@@ -246,7 +247,7 @@ class GroupCommit:
 
     def _recover(self) -> None:
         log.warning("the store works again")
-        self._failure, self._pause_s = None, _FIRST_PAUSE_S
+        self._failure, self._lasting, self._pause_s = None, False, _FIRST_PAUSE_S
 
     def _fail(self, error: Exception) -> None:
         self._metrics.store_failures.inc()
@@ -254,7 +255,7 @@ class GroupCommit:
         # Consecutive failures of one cause are logged once.
         if failure != self._failure:
             log.error("the store fails, queued changes are tried again: %s", failure)
-        self._failure = failure
+        self._failure, self._lasting = failure, isinstance(error, WriteFailed) and error.lasting
 
 
 def _answer_late(reached: asyncio.Future[bool]) -> None:

@@ -55,7 +55,7 @@ class MissionLog:
 class NullJournal:
     """The journal of an edge without a store: missions live as long as the process."""
 
-    failing = replaced = False
+    failing, fault = False, None
 
     def begin(self, mission: Mission, epoch: int = 0) -> None:
         """Ignore a new mission."""
@@ -105,9 +105,9 @@ class Journal:
         return self._commits.failing
 
     @property
-    def replaced(self) -> bool:
-        """Whether it failed because a file of the store was deleted or replaced."""
-        return self._commits.replaced
+    def fault(self) -> str | None:
+        """As :attr:`GroupCommit.fault`."""
+        return self._commits.fault
 
     def begin(self, mission: Mission, epoch: int = 0) -> None:
         """Record a new mission, and every event of it from now on."""

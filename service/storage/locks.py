@@ -22,7 +22,7 @@ class FileLock:
         descriptors: of the lock file. A process that inherits it shares the lock.
 
     Raises:
-        StoreUnusable: another edge has the lock.
+        StoreUnusable: another edge has the lock, or may have it under another name of the file.
         OSError: the lock file cannot be made.
     """
 
@@ -35,12 +35,15 @@ class FileLock:
         while True:
             try:
                 fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                return
+                break
             except BlockingIOError:
                 if time.monotonic() >= ends:
                     self._lock.close()
                     raise StoreUnusable(f"another edge uses {self.file}") from None
             time.sleep(_RETRY_S)
+        if os.path.exists(self.file) and os.stat(self.file).st_nlink > 1:
+            self._lock.close()
+            raise StoreUnusable(f"{self.file} has another name (a hard link), and SQLite a log for each: delete one")
 
     def close(self) -> None:
         """Release the lock."""

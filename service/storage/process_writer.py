@@ -34,12 +34,16 @@ class ProcessWriter:
         path: of the file.
         locks: descriptors of the file's locks. The process inherits them, so that no other edge takes the file between
             the end of a killed edge and that edge's last commit.
+        epoch: of the edge that owns the file.
     """
 
-    def __init__(self, statements: Statements, path: str, locks: Sequence[int]) -> None:
+    def __init__(self, statements: Statements, path: str, locks: Sequence[int], epoch: int) -> None:
         self._statements = statements
         self._path = path
         self._locks = locks
+        self._epoch = epoch
+        # The failure after which nothing is written any more.
+        self._final: WriteFailed | None = None
         # Another writer, after this one was killed, has to find the same files.
         self._known = {file: known for file in (path, f"{path}.lock") if (known := identity(file))}
         self._process: subprocess.Popen[bytes] | None = None
@@ -61,6 +65,8 @@ class ProcessWriter:
 
     def write(self, changes: Sequence[Change], done: Done) -> None:
         """As :class:`Writer` says."""
+        if self._final is not None:
+            raise self._final
         transaction = msgpack.packb(self._statements.of(changes), buf_size=PACK_BYTES)
         self._frame = LENGTH.pack(len(transaction)) + transaction
         self._repeated = False
@@ -100,12 +106,12 @@ class ProcessWriter:
     def _start(self) -> socket.socket:
         ours, theirs = socket.socketpair()
         ours.setblocking(False)
-        files = [part for file in self._known.items() for part in file]
+        arguments = [self._path, str(self._epoch), *(part for file in self._known.items() for part in file)]
         with theirs:
             try:
                 self._process = subprocess.Popen(
                     # -P keeps the script's folder out of its path: some modules there have names of standard ones.
-                    [sys.executable, "-P", sqlite_process.__file__, str(theirs.fileno()), self._path, *files],
+                    [sys.executable, "-P", sqlite_process.__file__, str(theirs.fileno()), *arguments],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     # With the edge's own stderr, a reader of the edge's log would wait for a killed edge's last commit.
@@ -152,10 +158,13 @@ class ProcessWriter:
         end = LENGTH.size + LENGTH.unpack_from(self._incoming)[0]
         if len(self._incoming) < end:
             return
-        failure = msgpack.unpackb(self._incoming[LENGTH.size : end])
+        answer = msgpack.unpackb(self._incoming[LENGTH.size : end])
         del self._incoming[:end]
         self._frame, self._outgoing = b"", memoryview(b"")
-        self._report(None if failure is None else WriteFailed(failure))
+        failure = None if answer is None else WriteFailed(*answer)
+        if failure is not None and failure.final:
+            self._final = failure
+        self._report(failure)
 
     def _restart(self) -> None:
         """The process has ended: a second process tries its transaction once more."""

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Literal
+from zlib import crc32
 
 import msgpack
 import numpy as np
@@ -61,8 +62,10 @@ class Statements:
         put = put.on_conflict_do_update(index_elements=["mission_id"], set_=newer)
         of: sa.BindParameter[str] = sa.bindparam("of")
         until: sa.BindParameter[int] = sa.bindparam("until")
-        self._made = self._compiled(insert(missions).on_conflict_do_nothing(), *missions.c.keys())
-        self._entry = self._compiled(insert(journal).on_conflict_do_nothing(), *journal.c.keys())
+        self._made, self._entry = (
+            self._compiled(_conflict_fails(insert(table), key), *table.c.keys())
+            for table, key in ((missions, 1), (journal, 2))
+        )
         self._checkpoint = self._compiled(put, *checkpoints.c.keys())
         covered = sa.delete(journal).where((journal.c.mission_id == of) & (journal.c.seq <= until))
         self._covered = self._compiled(covered, "of", "until")
@@ -105,6 +108,18 @@ class Statements:
         keys = names if isinstance(statement, sa.Insert) else None
         sql = str(statement.compile(dialect=self._dialect, column_keys=keys))
         return _Compiled(sql, None if self._dialect.positional else names)
+
+
+def _conflict_fails(put: Any, key: int) -> Any:
+    """An insert that ignores a row that is there already, and fails where its bytes differ.
+
+    Args:
+        key: the number of columns of the primary key, which come first.
+    """
+    names = put.table.c.keys()
+    differ = sa.or_(*(put.table.c[name] != put.excluded[name] for name in names[key:]))
+    # The last column must not be null.
+    return put.on_conflict_do_update(index_elements=names[:key], set_={names[-1]: sa.null()}, where=differ)
 
 
 def encode(event: Event) -> tuple[Kind, bytes]:
@@ -153,18 +168,29 @@ def decode(kind: str, data: bytes) -> Event:
 
 
 def pack(value: Any) -> bytes:
-    """Bytes of nested dicts, lists, numbers, strings and arrays; raises ``TypeError`` for anything else."""
+    """Bytes of nested dicts, lists, numbers, strings and arrays, and their checksum in the last four.
+
+    Raises:
+        TypeError: for anything else.
+    """
     # The default buffer of 256 KB is mapped and unmapped by each call, since malloc's threshold is fixed.
     packed: bytes = msgpack.packb(value, default=_default, buf_size=PACK_BYTES)
-    return packed
+    return packed + _checksum(packed)
 
 
 def unpack(data: bytes) -> Any:
     """The value that was packed, with lists for tuples; raises ``ValueError`` for damaged bytes."""
+    data, checksum = data[:-4], data[-4:]
+    if checksum != _checksum(data):
+        raise ValueError("damaged bytes: their checksum differs")
     try:
         return msgpack.unpackb(data, ext_hook=_array, strict_map_key=False)
     except (TypeError, msgpack.UnpackException) as damaged:
         raise ValueError(f"damaged bytes: {damaged}") from damaged
+
+
+def _checksum(data: bytes) -> bytes:
+    return crc32(data).to_bytes(4, "little")
 
 
 def _default(value: Any) -> Any:

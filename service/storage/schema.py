@@ -3,7 +3,7 @@
 import sqlalchemy as sa
 
 # The newest version in service/storage/migrations/versions.
-SCHEMA = "0004"
+SCHEMA = "0005"
 
 metadata = sa.MetaData()
 missions = sa.Table(

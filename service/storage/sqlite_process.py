@@ -1,8 +1,8 @@
 """The process that writes a SQLite store, so that commits and decisions do not wait for the same interpreter.
 
 :class:`service.storage.process_writer.ProcessWriter` runs it and is connected by a socket. Each message is MessagePack
-after its length in four bytes. A request is a transaction, a list of [SQL, rows]. Its answer is nil, or the reason of
-the failure.
+after its length in four bytes. A request is a transaction, a list of [SQL, rows]. Its answer is nil, or the failure as
+the arguments of :class:`service.storage.writer.WriteFailed`.
 
 The process ends when the socket is closed, after its last commit, even if the edge was killed. It imports very little,
 so that it takes 17 MB and starts in a twentieth of a second.
@@ -22,8 +22,6 @@ from urllib.parse import quote
 import msgpack
 
 LENGTH = struct.Struct("<I")
-# In the reason of a failure that lasts until the edge ends, unless the file is put back.
-REPLACED = "was deleted or replaced while the edge ran"
 # Milliseconds that a transaction waits while another program has the file locked.
 BUSY_MS = 1000
 # WAL: readers and the writer do not wait for each other. FULL: a commit survives a power failure.
@@ -37,17 +35,30 @@ def framed(message: Any) -> bytes:
 
 
 def identity(file: str) -> str:
-    """The device and the inode of a file; empty if there is none."""
+    """The device, the inode and the number of names of a file; empty if there is none."""
+    return _facts(file)[0]
+
+
+def _facts(file: str) -> tuple[str, str]:
+    """The identity of a file, and its size and time of change."""
     try:
         found = os.stat(file)
     except OSError:
-        return ""
-    return f"{found.st_dev}:{found.st_ino}"
+        return "", ""
+    return f"{found.st_dev}:{found.st_ino}:{found.st_nlink}", f"{found.st_size}:{found.st_mtime_ns}"
 
 
-def serve(edge: socket.socket, path: str, known: Mapping[str, str]) -> None:
+class Displaced(Exception):
+    """A file of the store was deleted, replaced or hard-linked, and may be put back."""
+
+
+class Changed(Exception):
+    """Another program has written the store: this edge must not write it any more."""
+
+
+def serve(edge: socket.socket, path: str, epoch: int, known: Mapping[str, str]) -> None:
     """Commit the transactions that the edge sends, until it closes the socket; arguments as :class:`Database`."""
-    database = Database(path, known)
+    database = Database(path, epoch, known)
     with edge.makefile("rb") as sent:
         while len(head := sent.read(LENGTH.size)) == LENGTH.size:
             (length,) = LENGTH.unpack(head)
@@ -61,32 +72,41 @@ class Database:
     """A connection that opens at its first transaction, and again after each failure.
 
     A commit to a deleted file would be lost when the edge ends. So a commit fails if the file, its lock file or its
-    write-ahead log was deleted or replaced.
+    write-ahead log was deleted, replaced or given another name, or if another program has written any of them.
 
     Args:
         path: of the SQLite file, which must exist.
+        epoch: of the edge that owns the file; the file has it as its ``user_version``.
         known: the identity of the file and of its lock's file, as the edge opened them, by path.
     """
 
-    def __init__(self, path: str, known: Mapping[str, str]) -> None:
+    def __init__(self, path: str, epoch: int, known: Mapping[str, str]) -> None:
         self._path = path
+        self._epoch = epoch
         self._known = known
         self._db: sqlite3.Connection | None = None
-        # The identity of this connection's write-ahead log.
+        # The identity of this connection's write-ahead log, and both files' sizes and times after its last commit.
         self._log = ""
+        self._written: list[str] = []
 
-    def commit(self, transaction: list[tuple[str, list[Any]]]) -> str | None:
-        """Commit a transaction; returns None, or the reason why nothing of it was committed."""
+    def commit(self, transaction: list[tuple[str, list[Any]]]) -> tuple[str, bool, bool] | None:
+        """Commit a transaction; returns None, or the arguments of ``WriteFailed`` if nothing of it was committed."""
         try:
             db = self._db or self._open()
+            if self._written and self._inspect(db) != self._written:
+                raise Changed("another program has changed the store's file: restart the edge")
             db.execute("BEGIN IMMEDIATE")
+            if db.execute("PRAGMA user_version").fetchone()[0] != self._epoch:
+                raise Changed("another edge has opened the store's file: end one of them, and restart the other")
             for sql, rows in transaction:
                 db.executemany(sql, rows)
             db.execute("COMMIT")
-            self._check(db)
+            self._written = self._inspect(db)
         except Exception as error:
             self.close()
-            return str(error) or type(error).__name__
+            # Damage is of this class itself; a full disk or a lock is of a class below it.
+            final = isinstance(error, Changed) or type(error) is sqlite3.DatabaseError
+            return str(error) or type(error).__name__, final or isinstance(error, Displaced), final
         return None
 
     def close(self) -> None:
@@ -96,21 +116,24 @@ class Database:
                 self._db.close()
             self._db = None
         self._log = ""
+        self._written = []
 
-    def _check(self, db: sqlite3.Connection) -> None:
-        """Raises ``OSError`` if the commit is in a file that the next edge will not open."""
-        self._check_known()
-        log = identity(f"{self._path}-wal")
+    def _inspect(self, db: sqlite3.Connection) -> list[str]:
+        """Sizes and times of the files; raises ``Displaced`` if the next edge will not open the same ones."""
+        found = [self._check_known(), *_facts(f"{self._path}-wal")]
+        log = found.pop(1)
         self._log = self._log or log
         if not log or log != self._log:
             # The commits of the log that was deleted go into the file, and the next transaction begins another log.
             db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-            raise OSError(f"{self._path}-wal {REPLACED}")
+            raise _displaced(f"{self._path}-wal")
+        return found
 
-    def _check_known(self) -> None:
+    def _check_known(self) -> str:
         for file, known in self._known.items():
             if identity(file) != known:
-                raise OSError(f"{file} {REPLACED}: put it back, or restart the edge")
+                raise _displaced(file)
+        return _facts(self._path)[1]
 
     def _open(self) -> sqlite3.Connection:
         self._check_known()
@@ -121,9 +144,14 @@ class Database:
         return self._db
 
 
+def _displaced(file: str) -> Displaced:
+    name = os.path.basename(file)
+    return Displaced(f"{name} was deleted, replaced or hard-linked while the edge ran: undo that, or restart the edge")
+
+
 if __name__ == "__main__":
     # A terminal or a service manager sends these signals to the edge and to its children.
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
     with socket.socket(fileno=int(sys.argv[1])) as other, suppress(ConnectionError):
-        serve(other, sys.argv[2], dict(zip(sys.argv[3::2], sys.argv[4::2], strict=True)))
+        serve(other, sys.argv[2], int(sys.argv[3]), dict(zip(sys.argv[4::2], sys.argv[5::2], strict=True)))

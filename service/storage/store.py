@@ -31,7 +31,7 @@ _IDLE_MS = 1500
 # An arbitrary key, which no other program of the same database may use.
 _MIGRATING = 0x41494356
 # Schemas of versions before the first release, whose missions this one cannot read.
-_UNRELEASED = ("0001", "0002", "0003")
+_UNRELEASED = ("0001", "0002", "0003", "0004")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +75,7 @@ class Store:
             if file and self._engine.dialect.name == "sqlite":
                 self._lock = FileLock(file)
                 self._migrate()
+                self._epoch = self._own()
             else:
                 self.leases = Leases(self._engine)
                 self._migrate()
@@ -130,7 +131,18 @@ class Store:
         if self.leases is not None:
             return ThreadWriter(statements, self.leases, self._engine)
         assert self._lock is not None
-        return ProcessWriter(statements, self._lock.file, self._lock.descriptors)
+        return ProcessWriter(statements, self._lock.file, self._lock.descriptors, self._epoch)
+
+    def _own(self) -> int:
+        """Check the SQLite file, and raise its epoch, so that no edge that had it before can write it any more."""
+        with self._engine.connect() as db:
+            db.exec_driver_sql("BEGIN IMMEDIATE")
+            if (fault := db.exec_driver_sql("PRAGMA quick_check(1)").scalar()) != "ok":
+                raise StoreUnusable(f"the file is damaged: {fault}")
+            epoch: int = db.exec_driver_sql("PRAGMA user_version").scalar_one() + 1
+            db.exec_driver_sql(f"PRAGMA user_version = {epoch}")
+            db.commit()
+        return epoch
 
     def _migrate(self) -> None:
         """Bring the schema up to date. alembic is slow to import, so an up-to-date store does without it."""
@@ -211,4 +223,7 @@ def _prepare(connection: Any, _: object) -> None:
 def cause(error: Exception) -> str:
     """An error in one line, without the SQL statement and its parameters; drivers write no password."""
     origin = getattr(error, "orig", None) or error
+    if "not null" in str(origin).lower() or "not-null" in str(origin):
+        # Only a conflict with other bytes sets a column to null.
+        return f"another program has written other events of the same mission: {str(origin).splitlines()[0]}"
     return str(origin).strip().splitlines()[0] if str(origin).strip() else type(origin).__name__

@@ -10,7 +10,16 @@ Done = Callable[[Exception | None], None]
 
 
 class WriteFailed(Exception):
-    """The transaction is not durable, as far as the writer knows."""
+    """The transaction is not durable, as far as the writer knows.
+
+    Attributes:
+        lasting: later ones will fail too, until someone acts.
+        final: they will until the edge is restarted.
+    """
+
+    def __init__(self, reason: str, lasting: bool = False, final: bool = False) -> None:
+        super().__init__(reason)
+        self.lasting, self.final = lasting, final
 
 
 class Writer(Protocol):

@@ -42,19 +42,19 @@ class StoreHere(Store):
     def writer(self) -> WriterHere:
         """A writer of the same statements."""
         assert isinstance(self._lock, FileLock)
-        return WriterHere(Statements(self._engine.dialect), self._lock.file)
+        return WriterHere(Statements(self._engine.dialect), self._lock.file, self._epoch)
 
 
 class WriterHere:
     """Commits as the writing process does, on the event loop."""
 
-    def __init__(self, statements: Statements, path: str) -> None:
-        self._statements, self._database = statements, Database(path, {})
+    def __init__(self, statements: Statements, path: str, epoch: int) -> None:
+        self._statements, self._database = statements, Database(path, epoch, {})
 
     def write(self, changes: Sequence[Change], done: Done) -> None:
         """As ``Writer`` says."""
-        reason = self._database.commit(msgpack.unpackb(msgpack.packb(self._statements.of(changes))))
-        asyncio.get_running_loop().call_soon(done, None if reason is None else WriteFailed(reason))
+        failed = self._database.commit(msgpack.unpackb(msgpack.packb(self._statements.of(changes))))
+        asyncio.get_running_loop().call_soon(done, None if failed is None else WriteFailed(*failed))
 
     def close(self) -> None:
         """As ``Writer`` says."""

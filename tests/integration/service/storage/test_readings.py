@@ -11,7 +11,7 @@ from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal
 from service.storage.recovery import restore_mission
-from service.storage.rows import decode
+from service.storage.rows import decode, pack
 from service.storage.store import Store
 from shared.wire.readings import SensorReading
 from shared.wire.schemas import MissionSpec
@@ -66,4 +66,6 @@ async def test_a_restored_mission_knows_what_its_sensors_said(tmp_path: Path, ch
 
 def test_a_damaged_event_is_refused() -> None:
     with pytest.raises(ValueError, match="damaged event read"):
-        decode("read", b"\x91\x92\x01\x02")
+        decode("read", pack([[1, 2]]))
+    with pytest.raises(ValueError, match="checksum"):
+        decode("read", pack([[1, 2]]).replace(b"\x02", b"\x03"))

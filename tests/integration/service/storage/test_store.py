@@ -31,7 +31,7 @@ def _of_schema(version: str, path: Path) -> None:
     [
         (_damaged, "not a database"),
         (partial(_of_schema, "9999"), "newer version"),
-        (partial(_of_schema, "0003"), "made before the first release"),
+        (partial(_of_schema, "0004"), "made before the first release"),
     ],
 )
 def test_a_store_that_cannot_be_used_is_refused_with_the_reason(

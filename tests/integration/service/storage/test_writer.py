@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import shutil
 import signal
 import sys
 from collections.abc import Callable
@@ -24,7 +23,7 @@ from service.storage.writer import WriteFailed
 from shared.wire.schemas import MissionSpec
 from tests.support.processes import serving_edge
 from tests.support.stored_missions import fly, kept, running, writers, written
-from tests.support.waiting import PATIENCE_S, until
+from tests.support.waiting import PATIENCE_S
 
 Report = Callable[..., dict[str, Any]]
 
@@ -174,63 +173,3 @@ async def test_a_transaction_is_written_whole_or_not_at_all_and_the_next_one_is(
     await asyncio.sleep(0)
     writer.close()
     store.close()
-
-
-def _replaced(path: Path) -> None:
-    shutil.copy(path, path.with_name("copy"))
-    path.with_name("copy").replace(path)
-
-
-@pytest.mark.parametrize(
-    ("harm", "named"),
-    [
-        (lambda path: path.unlink(), "m.db"),
-        (_replaced, "m.db"),
-        (lambda path: path.parent.rename(path.parent.with_name("elsewhere")), "m.db"),
-        # Then another edge can have the lock too.
-        (lambda path: path.with_name("m.db.lock").unlink(), "m.db.lock"),
-    ],
-    ids=["deleted", "replaced", "folder renamed", "lock deleted"],
-)
-def test_what_goes_into_a_file_without_a_name_is_not_stored(
-    tmp_path: Path, report: Report, caplog: pytest.LogCaptureFixture, harm: Callable[[Path], object], named: str
-) -> None:
-    folder = tmp_path / "stores"
-    folder.mkdir()
-    path = folder / "m.db"
-    with running(path) as (client, _):
-        assert client.post("/decide", json=report()).json()["stored"]
-        harm(path)
-        assert not client.post("/decide", json=report(step=1)).json()["stored"]
-        assert client.get("/readyz").status_code == 503
-        # Nor does another process that writes take another file for this one.
-        writers(os.getpid())[0].kill()
-        assert not client.post("/decide", json=report(step=2)).json()["stored"]
-    assert f"stores/{named} was deleted or replaced while the edge ran" in caplog.text
-    assert path.exists() == (named != "m.db" or harm is _replaced)
-
-
-def test_a_file_that_is_put_back_is_the_store_again(tmp_path: Path, report: Report) -> None:
-    path = tmp_path / "m.db"
-    with running(path) as (client, _):
-        assert client.post("/decide", json=report()).json()["stored"]
-        path.rename(tmp_path / "moved")
-        assert not client.post("/decide", json=report(step=1)).json()["stored"]
-        (tmp_path / "moved").rename(path)
-        until(lambda: client.get("/readyz").status_code == 200)
-        assert client.post("/decide", json=report(step=2)).json()["stored"]
-    with running(path) as (client, _):
-        assert client.get("/missions/test").json()["decisions"] == 3
-
-
-def test_a_log_that_is_deleted_loses_nothing(tmp_path: Path, report: Report, caplog: pytest.LogCaptureFixture) -> None:
-    path = tmp_path / "m.db"
-    with running(path) as (client, _):
-        assert client.post("/decide", json=report()).json()["stored"]
-        path.with_name("m.db-wal").unlink()
-        client.post("/decide", json=report(step=1))
-        until(lambda: client.get("/readyz").status_code == 200)
-        assert client.post("/decide", json=report(step=2)).json()["stored"]
-    assert "m.db-wal was deleted or replaced while the edge ran" in caplog.text
-    with running(path) as (client, _):
-        assert client.get("/missions/test").json()["decisions"] == 3
