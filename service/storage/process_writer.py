@@ -106,7 +106,9 @@ class ProcessWriter:
     def _start(self) -> socket.socket:
         ours, theirs = socket.socketpair()
         ours.setblocking(False)
-        arguments = [self._path, str(self._epoch), *(part for file in self._known.items() for part in file)]
+        arguments = [self._path, str(self._epoch)]
+        for file, known in self._known.items():
+            arguments += [file, ":".join(map(str, known))]
         with theirs:
             try:
                 self._process = subprocess.Popen(

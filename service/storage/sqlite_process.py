@@ -34,18 +34,23 @@ def framed(message: Any) -> bytes:
     return LENGTH.pack(len(packed)) + packed
 
 
-def identity(file: str) -> str:
-    """The device, the inode and the number of names of a file; empty if there is none."""
+# The device, the inode and the number of names of a file; empty if there is none.
+Identity = tuple[int, ...]
+# The same, and a file's size and time of change.
+Facts = tuple[Identity, tuple[int, int]]
+
+
+def identity(file: str) -> Identity:
+    """The identity of a file."""
     return _facts(file)[0]
 
 
-def _facts(file: str) -> tuple[str, str]:
-    """The identity of a file, and its size and time of change."""
+def _facts(file: str) -> Facts:
     try:
         found = os.stat(file)
     except OSError:
-        return "", ""
-    return f"{found.st_dev}:{found.st_ino}:{found.st_nlink}", f"{found.st_size}:{found.st_mtime_ns}"
+        return (), (0, 0)
+    return (found.st_dev, found.st_ino, found.st_nlink), (found.st_size, found.st_mtime_ns)
 
 
 class Displaced(Exception):
@@ -56,7 +61,7 @@ class Changed(Exception):
     """Another program has written the store: this edge must not write it any more."""
 
 
-def serve(edge: socket.socket, path: str, epoch: int, known: Mapping[str, str]) -> None:
+def serve(edge: socket.socket, path: str, epoch: int, known: Mapping[str, Identity]) -> None:
     """Commit the transactions that the edge sends, until it closes the socket; arguments as :class:`Database`."""
     database = Database(path, epoch, known)
     with edge.makefile("rb") as sent:
@@ -80,20 +85,19 @@ class Database:
         known: the identity of the file and of its lock's file, as the edge opened them, by path.
     """
 
-    def __init__(self, path: str, epoch: int, known: Mapping[str, str]) -> None:
+    def __init__(self, path: str, epoch: int, known: Mapping[str, Identity]) -> None:
         self._path = path
         self._epoch = epoch
         self._known = known
         self._db: sqlite3.Connection | None = None
-        # The identity of this connection's write-ahead log, and both files' sizes and times after its last commit.
-        self._log = ""
-        self._written: list[str] = []
+        # The file, and after a commit its write-ahead log, as this connection left them.
+        self._left: list[Facts] = []
 
     def commit(self, transaction: list[tuple[str, list[Any]]]) -> tuple[str, bool, bool] | None:
         """Commit a transaction; returns None, or the arguments of ``WriteFailed`` if nothing of it was committed."""
         try:
             db = self._db or self._open()
-            if self._written and self._inspect(db) != self._written:
+            if len(self._left) > 1 and self._inspect(db) != self._left:
                 raise Changed("another program has changed the store's file: restart the edge")
             db.execute("BEGIN IMMEDIATE")
             if db.execute("PRAGMA user_version").fetchone()[0] != self._epoch:
@@ -101,7 +105,8 @@ class Database:
             for sql, rows in transaction:
                 db.executemany(sql, rows)
             db.execute("COMMIT")
-            self._written = self._inspect(db)
+            self._left = self._inspect(db)
+            self._check_known(self._path)
         except Exception as error:
             self.close()
             # Damage is of this class itself; a full disk or a lock is of a class below it.
@@ -115,25 +120,24 @@ class Database:
             with suppress(sqlite3.Error):
                 self._db.close()
             self._db = None
-        self._log = ""
-        self._written = []
+        self._left = []
 
-    def _inspect(self, db: sqlite3.Connection) -> list[str]:
-        """Sizes and times of the files; raises ``Displaced`` if the next edge will not open the same ones."""
-        found = [self._check_known(), *_facts(f"{self._path}-wal")]
-        log = found.pop(1)
-        self._log = self._log or log
-        if not log or log != self._log:
+    def _inspect(self, db: sqlite3.Connection) -> list[Facts]:
+        """The file and its log; raises ``Displaced`` if the next edge will not open the same ones."""
+        log = f"{self._path}-wal"
+        found = [_facts(self._path), _facts(log)]
+        if found[0][0] != self._left[0][0]:
+            raise _displaced(self._path)
+        if not found[1][0] or (len(self._left) > 1 and found[1][0] != self._left[1][0]):
             # The commits of the log that was deleted go into the file, and the next transaction begins another log.
             db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-            raise _displaced(f"{self._path}-wal")
+            raise _displaced(log)
         return found
 
-    def _check_known(self) -> str:
+    def _check_known(self, but: str = "") -> None:
         for file, known in self._known.items():
-            if identity(file) != known:
+            if file != but and identity(file) != known:
                 raise _displaced(file)
-        return _facts(self._path)[1]
 
     def _open(self) -> sqlite3.Connection:
         self._check_known()
@@ -141,6 +145,7 @@ class Database:
         self._db = sqlite3.connect(f"file:{quote(self._path)}?mode=rw", uri=True, isolation_level=None)
         for pragma in PRAGMAS:
             self._db.execute(f"PRAGMA {pragma}")
+        self._left = [_facts(self._path)]
         return self._db
 
 
@@ -154,4 +159,7 @@ if __name__ == "__main__":
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
     with socket.socket(fileno=int(sys.argv[1])) as other, suppress(ConnectionError):
-        serve(other, sys.argv[2], int(sys.argv[3]), dict(zip(sys.argv[4::2], sys.argv[5::2], strict=True)))
+        opened = {
+            file: tuple(map(int, known.split(":"))) for file, known in zip(sys.argv[4::2], sys.argv[5::2], strict=True)
+        }
+        serve(other, sys.argv[2], int(sys.argv[3]), opened)

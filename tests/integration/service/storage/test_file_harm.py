@@ -68,7 +68,7 @@ DISPLACED = "was deleted, replaced or hard-linked while the edge ran: undo that,
         (lambda path: os.link(path, path.with_name("link.db")), f"m.db {DISPLACED}"),
         # Then another edge can have the lock too.
         (lambda path: path.with_name("m.db.lock").unlink(), f"m.db.lock {DISPLACED}"),
-        (_opened_by_another_edge, f"m.db.lock {DISPLACED}"),
+        (_opened_by_another_edge, CHANGED),
         (_copied_over, CHANGED),
         (_overwritten, CHANGED),
         (lambda path: os.truncate(path, PAGE), CHANGED),
