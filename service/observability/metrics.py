@@ -83,7 +83,7 @@ class Metrics:
 
     def __init__(self) -> None:
         # A series for each series, of no use to Prometheus.
-        disable_created_metrics()
+        disable_created_metrics()  # type: ignore[no-untyped-call]
         self.registry = CollectorRegistry()
         ProcessCollector(registry=self.registry)
         PlatformCollector(registry=self.registry)

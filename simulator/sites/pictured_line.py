@@ -24,9 +24,9 @@ def chained(parts: Sequence[FloatArray]) -> tuple[FloatArray, float]:
     ends[0] = np.inf
     for _ in parts[1:]:
         gaps = np.stack([np.linalg.norm(ends - at, axis=2) for at in (line[0][0], line[-1][-1])])
-        after, index, last = np.unravel_index(np.argmin(gaps), gaps.shape)
+        after, index, last = (int(at) for at in np.unravel_index(np.argmin(gaps), gaps.shape))
         widest = max(widest, float(gaps[after, index, last]))
-        part = parts[index] if bool(after) != bool(last) else parts[index][::-1]
+        part = parts[index] if after != last else parts[index][::-1]
         ends[index] = np.inf
         if after:
             line.append(part)
