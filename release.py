@@ -221,6 +221,7 @@ def expect_version(said: str, version: str) -> None:
 
 
 def step(what: str) -> None:
+    """Print the heading of a step."""
     console.rule(what, align="left")
 
 
@@ -235,6 +236,7 @@ def output(*command: str | Path, cwd: Path = ROOT) -> str:
 
 
 def succeeds(*command: str) -> bool:
+    """Whether a command, without its output, ends with code 0."""
     return subprocess.run(command, check=False, capture_output=True).returncode == 0
 
 

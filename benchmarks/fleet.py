@@ -11,6 +11,8 @@ is the ratio of their p99. Client and edge share the machine's cores. It prints 
 
 from __future__ import annotations
 
+import functools
+import operator
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -100,7 +102,7 @@ def _learning(args: Fleet, radios: Sequence[Radio], missions: Sequence[Flown]) -
         return lambda _: paced(radios, missions, args.block, args.pace, learn)
 
     took = in_turn({"with_outcomes": block(True), "without": block(False)}, args.rounds)
-    told = {name: _percentiles(sum(blocks, [])) for name, blocks in took.items()}
+    told = {name: _percentiles(functools.reduce(operator.iadd, blocks, [])) for name, blocks in took.items()}
     ratios = {f"{p}_ratio": round(told["with_outcomes"][p] / told["without"][p], 2) for p in ("p50_ms", "p99_ms")}
     return {"pace": args.pace, "missions": len(missions), **told, **ratios}
 

@@ -36,7 +36,7 @@ _DEGREES = 1e-7
 
 def require_mavsdk() -> None:
     """Raises ``ModuleNotFoundError`` without MAVSDK, and ``UsageError`` with one before version 4."""
-    import mavsdk  # noqa: F401
+    import mavsdk
 
     try:
         import mavsdk.asyncio  # noqa: F401
@@ -166,7 +166,7 @@ class MavlinkVehicle:
             if silent and not ended.is_set():
                 with suppress(MavsdkError):
                     await self._telemetry.set_rate_position(_POSITIONS_HZ)
-            if (silent or first and not await self._telemetry.landed_state()) and not ended.is_set():
+            if (silent or (first and not await self._telemetry.landed_state())) and not ended.is_set():
                 with suppress(MavsdkError):
                     await self._telemetry.set_rate_landed_state(_LANDED_HZ)
             first = False

@@ -27,7 +27,7 @@ PAGE, MAP, FIGURES = "page", "claims-map", "paper-figures"
 
 
 @dataclass(frozen=True)
-class ExperimentOptions:
+class ExperimentOptions:  # noqa: D101
     __doc__ = f"""Make a figure or table of the paper, or one beyond it, over many worlds.
 
     NAME is one of these, or `{ALL}` for every one:

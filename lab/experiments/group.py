@@ -26,6 +26,7 @@ class Group:
 
 
 def groups_of(plan: ExperimentPlan, load: Callable[[str], FlightRecord | None]) -> list[Group]:
+    """The plan's groups; those with a flight that has no record are left out."""
     sites = list(dict.fromkeys(planned.site_name for planned in plan.flights))
     flights: dict[tuple[str, str], list[FlightRecord]] = {}
     schemes = {planned.scheme.name: planned.scheme for planned in plan.flights}

@@ -6,6 +6,7 @@ marker in every figure (see ``LOOKS``).
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 import textwrap
@@ -298,7 +299,7 @@ def _sweep(result: Result, figure: Figure) -> mpl.Figure | None:
 def _sweep_panel(axes: Axes, result: Result, measure: str, points: Sequence[tuple[float, str]]) -> None:
     found = [(at, i) for at, name in points if (i := measured(result, name, measure))]
     colour, dash, marker = LOOKS["llm"]
-    gap = min((b - a for (a, _), (b, _) in zip(points, points[1:], strict=False) if b > a), default=1.0)
+    gap = min((b - a for (a, _), (b, _) in itertools.pairwise(points) if b > a), default=1.0)
     for at, interval in found:
         seeds = [value for value in interval.values if _finite(value)]
         if len(seeds) > 1:

@@ -90,6 +90,7 @@ class _Handler(BaseHTTPRequestHandler):
         except ValueError as error:
             return self._answer(400, {"error": {"message": str(error)}})
         self._answer(200, {"choices": [{"index": 0, "message": message, "finish_reason": "stop"}]})
+        return None
 
     def _answer(self, status: int, body: dict[str, Any]) -> None:
         content = json.dumps(body).encode()

@@ -11,8 +11,7 @@ from fastapi import FastAPI
 from fastapi.routing import APIRoute
 from starlette.middleware.gzip import GZipMiddleware
 
-from service.api import live_routes as live_routes
-from service.api import problem_details
+from service.api import live_routes, problem_details
 from service.api.api_keys import ApiKeys
 from service.api.authentication import KeyAuthentication
 from service.api.host_names import KnownHosts

@@ -114,6 +114,7 @@ class _Orders:
         if len(words) < 3 or words[-2] != "every":
             raise BadOrders("a visit has no period")
         self._wish(words[:-2], "visit_every", self._period(words[-1]))
+        return None
 
     def _ignore(self, words: list[str]) -> None:
         if words == [OTHERS]:

@@ -5,6 +5,7 @@ an order must occur in the note, as digits or as a word, and two orders may not 
 detects an LLM that invents an order.
 """
 
+import itertools
 import json
 import math
 import re
@@ -133,7 +134,7 @@ def _orders_in(text: str) -> list[str]:
 def _features(note: str) -> frozenset[str]:
     """Words and pairs of words; every number is the same word."""
     tokens = ["#" if number_of(token) is not None else token for token in _TOKEN.findall(note.lower())]
-    return frozenset(tokens) | {" ".join(pair) for pair in zip(tokens, tokens[1:], strict=False)}
+    return frozenset(tokens) | {" ".join(pair) for pair in itertools.pairwise(tokens)}
 
 
 @cache

@@ -36,6 +36,7 @@ def dot(one: Floats, other: Floats, terms: Floats) -> np.float32:
 
 @inlined
 def total(cost: Floats) -> float:
+    """The sum of costs ``(J,)``."""
     total = 0.0
     for j in range(len(cost)):
         total += cost[j]

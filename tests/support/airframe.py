@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import TypeVar
 
 EARTH_M = 6_371_008.8
@@ -61,7 +61,7 @@ class Airframe:
         places = [(item.latitude, item.longitude) for item in items if item.command == 16]
         self._north, self._east = math.radians(places[0][0]), math.radians(places[0][1])
         ring = [self._metres(*place) for place in (*places, places[0])]
-        self._legs = list(zip(ring, ring[1:], strict=False))
+        self._legs = list(pairwise(ring))
         self.length_m = sum(math.dist(*leg) for leg in self._legs)
         self.speed, self.mode, self.armed, self.flown_m = speed, "mission", True, start_m
         self.ground_speed, self.top, self.accelerates = min(speed, top), top, accelerates

@@ -47,5 +47,4 @@ def uav(
 
 
 def attended(mission: Mission, state: UavState, step: int = 0) -> AttendedState:
-    view = AttendedState.of(mission, state, step)
-    return view
+    return AttendedState.of(mission, state, step)

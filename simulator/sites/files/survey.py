@@ -27,7 +27,7 @@ def _is_wgs84(name: str) -> bool:
     *words, last = re.findall(r"[a-z0-9]+", name.lower().removesuffix("/proj4/")) or [""]
     if last in ("4326", "4979"):
         return "epsg" in words
-    return last in ("crs84", "crs84h", "wgs84") or last == "84" and words[-1:] in (["crs"], ["wgs"])
+    return last in ("crs84", "crs84h", "wgs84") or (last == "84" and words[-1:] in (["crs"], ["wgs"]))
 
 
 def _on_earth(position: list[float]) -> list[float]:

@@ -28,7 +28,7 @@ def flights(**losses: Sequence[int]) -> dict[str, Flown]:
 
 OURS = ("look_ahead_random_k5", "look_ahead_shipped_k5", "value")
 AS_THE_PAPER_SAYS = flights(
-    **dict.fromkeys((*OURS, "look_ahead_random_k7", "look_ahead_shipped_k7", "look_ahead_all"), [9, 9, 9, 9]),
+    **{key: [9, 9, 9, 9] for key in (*OURS, "look_ahead_random_k7", "look_ahead_shipped_k7", "look_ahead_all")},
     eof=[1] * 20,
     wqcs=[1] * 18,
     madqn_paper=[2] * 25,

@@ -76,7 +76,7 @@ def test_an_operator_confirms_only_the_intended_guidance(edge: Edge, says: str, 
 def test_a_flight_records_its_guidance_and_obeys(edge: Edge) -> None:
     operator = Operator(says="structure", notes=NOTES)
     scheme = over_edge("intent", "intent", mode="value", backing=OFF, operator=operator)
-    [planned] = [p for p in plan(declared(scheme), setup(seeds=1)).flights]
+    [planned] = list(plan(declared(scheme), setup(seeds=1)).flights)
     at = EdgeAt(str(edge().base_url), None, lambda: None)
     flight = fly_with_edge(at, planned)
     assert (flight.meant, flight.guidance) == (MEANT, "confirmed")

@@ -57,7 +57,7 @@ def page(runs: Path) -> str:
 
 
 def section(text: str, name: str) -> str:
-    return text.split(f"\n### {name}\n")[1].split("\n### ")[0]
+    return text.split(f"\n### {name}\n")[1].split("\n### ", maxsplit=1)[0]
 
 
 @pytest.fixture(scope="module")

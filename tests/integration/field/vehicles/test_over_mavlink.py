@@ -6,7 +6,6 @@ import asyncio
 import math
 import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -47,11 +46,10 @@ def missions(tmp_path_factory: pytest.TempPathFactory) -> list[list[Item]]:
 
 
 @pytest.fixture
-def port() -> Iterator[int]:
+def port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
-        number = int(taken.getsockname()[1])
-    yield number
+        return int(taken.getsockname()[1])
 
 
 def arguments(port: int, edge: str, out: Path, *more: str) -> list[str]:

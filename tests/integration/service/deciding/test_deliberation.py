@@ -185,7 +185,7 @@ def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
     mission = guided(planner="off")
     trust = mission.trust["stub"]
     for step in range(15):
-        view, made = deliberation(mission, step)
+        _view, made = deliberation(mission, step)
         judgement = made.evaluate()
         label = answer(made, judgement.lost)
         word = np.array(
@@ -212,7 +212,7 @@ def test_trust_falls_for_the_worst_and_not_for_the_best() -> None:
 
 def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
     mission = guided()
-    view, made = deliberation(mission)
+    _view, made = deliberation(mission)
     judgement = made.evaluate()
     worst = max(made.candidates.labels, key=lambda name: judgement.lost[made.candidates.labels[name]])
     assert judgement.lost.max() - judgement.lost.min() > 8
@@ -226,7 +226,7 @@ def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
 
 def test_what_others_got_meanwhile_is_not_flown() -> None:
     mission = guided()
-    view, made = deliberation(mission)
+    _view, made = deliberation(mission)
     trust, judgement = mission.trust["stub"], made.evaluate()
     first = made.conclude(trust, judgement, None, calibrated=False)
     assert first is not None

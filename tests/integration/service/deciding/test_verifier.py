@@ -32,12 +32,12 @@ def ready(**spec: Any) -> tuple[Mission, AttendedState]:
 
 @pytest.mark.parametrize(("sensor", "velocity"), [(0, 0), (3, 14), (1, 7)])
 def test_what_is_in_reach_is_left_alone(sensor: int, velocity: int) -> None:
-    m, view = ready()
+    _m, view = ready()
     verify(view, Action(sensor, velocity))
 
 
 def test_out_of_reach_breaks_a_rule_unless_everything_is() -> None:
-    m, view = ready()
+    _m, view = ready()
     with pytest.raises(NoDecision) as broken:
         verify(view, Action(5, 14))
     assert broken.value.reason == "rule_reach"

@@ -234,7 +234,7 @@ async def test_other_bytes_of_the_same_event_are_an_error(
     # What was committed already may come again.
     await written(writer, right)
     for other in (made("test", epoch, seed=7), Entry("test", 1, GuidanceChanged({"note": "b"}), epoch)):
-        with pytest.raises(Exception) as failed:  # noqa: PT011 — each database has an exception of its own
+        with pytest.raises(Exception) as failed:
             await written(writer, [other])
         assert cause(failed.value).startswith("another program has written other events of the same mission: ")
     kept = store.load("test")

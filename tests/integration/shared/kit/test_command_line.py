@@ -29,7 +29,7 @@ def run(monkeypatch: pytest.MonkeyPatch, missing: str, name: str = "bound") -> i
 
 
 @pytest.mark.parametrize(
-    "name, missing, extra",
+    ("name", "missing", "extra"),
     [
         ("bound", "ortools.sat", "bound"),
         ("simulate", "numba", "planner"),

@@ -60,7 +60,7 @@ def test_ctrl_c_prints_the_best_so_far() -> None:
 
 
 @pytest.mark.parametrize(
-    "options, says",
+    ("options", "says"),
     [
         (["--seed", "-1"], "--seed -1"),
         (["--seed", "0", "--time-limit-s", "0"], "--time-limit-s 0"),

@@ -115,7 +115,7 @@ def test_another_mode_prompt_and_k_are_compared_and_different_decisions_are_not_
         "prompt.experiences": (30, 4),
         "prompt.selection": ("recent", "best"),
     }
-    assert list(again.by_source)[0] == "value"
+    assert next(iter(again.by_source)) == "value"
     assert again.replayed.prompt_tokens != again.logged.prompt_tokens
     replayed = lines(tmp_path / "again" / "replayed.jsonl")
     same = [

@@ -244,7 +244,7 @@ def test_losses_are_blamed_on_uavs_with_a_usable_link() -> None:
     world.reset(seed=4)
     while world.agents:
         before, now = world.sensors.queue.copy(), len(world.tally)
-        _, _, _, _, infos = world.step({a: (0, 3) for a in world.agents})
+        _, _, _, _, infos = world.step(dict.fromkeys(world.agents, (0, 3)))
         spilt = np.maximum(before - world.tally[-1].collected + world.sensors.arrivals[now] - 60, 0)
         for uav, info in enumerate(infos.values()):
             distance = np.hypot(*(world.sensors.positions - world.fleet.positions[uav]).T)

@@ -1,3 +1,4 @@
+import itertools
 from typing import Any, get_args
 
 import numpy as np
@@ -149,7 +150,7 @@ def test_what_is_retrieved_stands_in_the_last_block() -> None:
     extra = [len(state.splitlines()) - rows for _, _, state in prompts]
     assert extra[0] == 0
     assert max(extra) == 1
-    changes = sum(later[1] != earlier[1] for earlier, later in zip(prompts, prompts[1:], strict=False))
+    changes = sum(later[1] != earlier[1] for earlier, later in itertools.pairwise(prompts))
     assert changes == 2, "the cached block changes at a compaction alone, every fourth outcome"
 
 

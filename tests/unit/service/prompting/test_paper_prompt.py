@@ -1,4 +1,5 @@
 import hashlib
+import itertools
 import re
 from typing import Any, Literal
 
@@ -31,7 +32,7 @@ def test_the_static_block_is_the_same_bytes_at_every_step(order: Literal["score"
     prompts = flown(spec=MissionSpec(prompt=PromptStyle(order=order)))
     assert len({p.static for p in prompts}) == 1
     assert len({p.state for p in prompts}) > 1
-    for earlier, later in zip(prompts, prompts[1:], strict=False):
+    for earlier, later in itertools.pairwise(prompts):
         assert later.experiences.startswith(earlier.experiences)
 
 

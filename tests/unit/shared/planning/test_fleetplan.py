@@ -169,7 +169,7 @@ def test_the_same_problem_gives_the_same_plan() -> None:
     np.testing.assert_array_equal(one.actions, two.actions)
 
 
-@pytest.mark.parametrize("sensors, uavs", [(1, 1), (1, 2), (2, 3)])
+@pytest.mark.parametrize(("sensors", "uavs"), [(1, 1), (1, 2), (2, 3)])
 def test_fewer_sensors_than_uavs(sensors: int, uavs: int) -> None:
     problem = tiny(9, horizon=1, sensors=sensors, uavs=uavs)
     found = plan(problem, ENOUGH)
@@ -190,7 +190,7 @@ def test_more_arrivals_than_a_queue_holds_are_lost_whatever_is_done() -> None:
 
 
 @pytest.mark.parametrize(
-    "field, value",
+    ("field", "value"),
     [
         ("queue", np.array([1, 0])),
         ("queue", np.array([61, 0, 0])),

@@ -123,7 +123,7 @@ def test_what_need_not_be_told_is_left_out() -> None:
     assert DecideRequest.model_validate_json(again) == request and '"x"' not in again
     assert not {"base", "uplink"} & DecideRequest.model_validate(body()).model_dump().keys()
     assert "column y has 0 entries, column id has 3" in refusal(body(sensors=columns(y=[])))
-    nobody: dict[str, Any] = dict.fromkeys(told, [])
+    nobody: dict[str, Any] = {key: [] for key in told}
     assert "column id has no entries" in refusal(body(sensors=nobody))
     assert DecideRequest.model_validate_json(json.dumps(body(sensors=nobody, base=DECISION))).sensors.id == []
 

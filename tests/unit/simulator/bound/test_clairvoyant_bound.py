@@ -187,7 +187,7 @@ def test_a_plan_that_the_world_does_not_confirm_is_an_error(monkeypatch: pytest.
             clairvoyant(site, 3, workers=1)
 
 
-@pytest.mark.parametrize("sensors, uavs, steps", [(1, 1, 1), (1, 2, 2), (4, 1, 1)])
+@pytest.mark.parametrize(("sensors", "uavs", "steps"), [(1, 1, 1), (1, 2, 2), (4, 1, 1)])
 def test_the_smallest_worlds(sensors: int, uavs: int, steps: int) -> None:
     site = small(sensors=sensors, uavs=uavs, steps=steps)
     bound = clairvoyant(site, 0, time_limit_s=5, workers=1)

@@ -58,7 +58,7 @@ def worlds(draw: st.DrawFn) -> tuple[list[list[Cell]], list[Any], Any]:
     paths = draw(st.lists(st.lists(CELLS, min_size=2, max_size=5), min_size=1, max_size=2))
     drawn = draw(st.lists(areas("no_fly"), max_size=2)) + draw(st.lists(areas("fence"), max_size=1))
     shapes = [(role, [place(cell) for cell in cells], radius * size * 111_000) for role, cells, radius in drawn]
-    return [[cell for cell in path] for path in paths], shapes, place
+    return [list(path) for path in paths], shapes, place
 
 
 def drawn_feature(role: str, places: list[list[float]], radius_m: float) -> Json:

@@ -184,7 +184,7 @@ def test_an_observation_has_the_last_beacon_heard() -> None:
     held = 0
     for now in range(30):
         before = observations
-        observations, *_ = world.step({a: (now % 10, 14) for a in world.agents})
+        observations, *_ = world.step(dict.fromkeys(world.agents, (now % 10, 14)))
         for uav in range(3):
             was, seen = before[f"uav_{uav}"], observations[f"uav_{uav}"]
             distance = np.hypot(*(world.sensors.positions - world.fleet.positions[uav]).T)
@@ -221,7 +221,7 @@ def test_a_caller_cannot_change_the_world_through_an_observation() -> None:
     for name in ("queue", "battery", "channel_gain", "last_heard", "position", "sensor_position"):
         observations["uav_0"][name][:] = 7
     infos["uav_0"]["action_mask"][:] = 0
-    actions = {a: (0, 14) for a in touched.agents}
+    actions = dict.fromkeys(touched.agents, (0, 14))
     got, expected = touched.step(actions), left.step(actions)
     np.testing.assert_equal(got, expected)
 

@@ -41,7 +41,7 @@ def test_positions_are_reported_with_an_error_of_the_scenarios_size() -> None:
     errors = reported - world.fleet.positions
     assert errors.std() == pytest.approx(3.0, rel=0.15)
     assert abs(errors).max() <= 15.0
-    after, *_ = world.step({agent: (0, 0) for agent in world.agents})
+    after, *_ = world.step(dict.fromkeys(world.agents, (0, 0)))
     again = np.array([after[agent]["position"] for agent in world.agents]) - world.fleet.positions
     assert not np.any(again == errors)
 

@@ -57,7 +57,7 @@ def test_still_air_is_velocity_times_step() -> None:
 def test_the_progress_reported_is_the_one_flown() -> None:
     world = PipelineWorld(Scenario(wind_mps=6.0, gust_mps=2.0, position_noise_m=3.0))
     before, _ = world.reset(seed=0)
-    after, *_ = world.step({agent: (0, 10) for agent in world.agents})
+    after, *_ = world.step(dict.fromkeys(world.agents, (0, 10)))
     covered = [float(after[a]["progress"][0] - before[a]["progress"][0]) for a in world.agents]
     assert len({round(way, 3) for way in covered}) == 3
     assert all(0.0 < way < 200.0 and way != 100.0 for way in covered)

@@ -95,7 +95,7 @@ def test_an_import_leaves_whatever_is_there_but_for_trajectories(tmp_path: Path)
     assert import_plans([fenced], folder, overwrite=True).fences == 2, "the same fence comes once"
     write_world(folder, sensor("a"), around)
     assert import_plans([fenced], folder, overwrite=True).fences == 1, "the same but for a plan's digits"
-    assert list(read_survey(folder / "world.geojson").fences.values())[0].points[1] == tuple(ring[1])
+    assert next(iter(read_survey(folder / "world.geojson").fences.values())).points[1] == tuple(ring[1])
 
 
 @pytest.mark.parametrize(
