@@ -16,6 +16,7 @@ _KEPT = 0.97
 # Metres of still air of one step of the integration.
 _STRIDE_M = 50.0
 _SLOWEST, _FASTEST = 0.1, 2.0
+_BRAKING_M = 40.0
 
 
 class Drift:
@@ -50,7 +51,8 @@ class Drift:
             still_m: the commanded way ``v dt``, metres.
             end_m: progress at its end, metres.
         """
-        if still_m <= 0:
+        # An airframe with a top speed needs some way to slow down, so that a short one says nothing of the wind.
+        if still_m <= (_BRAKING_M if self.tops else 0.0):
             return
         # Progress may restart with every lap.
         flown_m = end_m - start_m + (path.length_m if end_m < start_m else 0.0)

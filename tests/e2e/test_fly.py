@@ -12,16 +12,19 @@ from typing import Any
 import pytest
 
 from field.vehicles.field_uav import LEAST_SPEED_M_S
+from shared.world.trajectory import trajectories
 from simulator.commands.replay import read_logged_mission
 from simulator.records.decision import Decision
 from simulator.records.mission_logs import read_decisions
 from simulator.records.real_uavs import sums_by_uav
 from simulator.records.summary import Summary
+from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.plans.plan_folder import export_plans
+from simulator.sites.site import Site
 from tests.support.airframe import once
 from tests.support.edge_stub import free_port
-from tests.support.processes import serving_edge, started
-from tests.support.pymavlink_peer import SET_MODE, SPEED, PymavlinkPeer, pymavlink_peer
+from tests.support.processes import run, serving_edge, started
+from tests.support.pymavlink_peer import ARDUPILOT, PAUSE, PX4, SET_MODE, SPEED, PymavlinkPeer, pymavlink_peer
 from tests.support.vehicle_worlds import mission_in, pipeline_folder, starts_m
 from tests.support.waiting import PATIENCE_S
 
@@ -53,15 +56,22 @@ class Printed(threading.Thread):
             time.sleep(0.05)
 
 
-def flown_with_an_outage(tmp_path: Path, speedup: float) -> tuple[list[Decision], list[PymavlinkPeer], str]:
-    """The decisions, the vehicles, and what the command printed; the edge is gone from the middle on, for 20 s."""
+def flown_with_an_outage(
+    tmp_path: Path, speedup: float, autopilot: int = PX4, **limits: float
+) -> tuple[list[Decision], list[PymavlinkPeer], str]:
+    """The decisions, the vehicles, and what the command printed; the edge is gone from the middle on, for 20 s.
+
+    ``limits`` are the airframes'.
+    """
     world = pipeline_folder(tmp_path / "pipeline_laps", SEED)
     plans = export_plans(world, tmp_path / "plans", overwrite=False)
     ports, log = [free_port() for _ in plans], tmp_path / "out"
     store = {"AICVDS_MODE": "policy", "AICVDS_STORE": f"sqlite:///{tmp_path}/missions.db"}
     with ExitStack() as stack:
         peers = [
-            stack.enter_context(pymavlink_peer(mission_in(plan), port, uav + 1, start_m=start, speedup=speedup))
+            stack.enter_context(
+                pymavlink_peer(mission_in(plan), port, uav + 1, autopilot, start_m=start, speedup=speedup, **limits)
+            )
             for uav, (plan, port, start) in enumerate(zip(plans, ports, starts_m(world, SEED), strict=True))
         ]
         first = stack.enter_context(ExitStack())
@@ -93,6 +103,48 @@ def test_every_waypoint_is_decided_though_the_edge_is_gone_for_twenty_seconds(tm
     assert len(read_logged_mission(tmp_path / "out").decisions) == STEPS * UAVS
     check_wire(peers, decisions)
     check_report(tmp_path / "out", decisions, told)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_airframes_with_limits_fly_what_is_decided_and_lose_no_more_than_the_simulators(tmp_path: Path) -> None:
+    decisions, peers, told = flown_with_an_outage(tmp_path, 1.0, ARDUPILOT, top=11.0, accelerates=2.5)
+    assert [(d.step, d.uav_id) for d in decisions] == [(step, uav) for step in range(STEPS) for uav in range(UAVS)]
+    real = Summary.model_validate_json((tmp_path / "out" / "summary.json").read_bytes()).real_uavs
+    assert real is not None and real.late == 0 and not real.undecided, told
+    assert not real.ended and not real.warnings
+    world = site_from_folder(tmp_path / "pipeline_laps")
+    for uav, peer in enumerate(peers):
+        assert all(gap_m(world, uav, place) < 1.0 for place in peer.airframe.trace)
+        assert {m.command for _, m in peer.received if m.get_type() == "COMMAND_LONG"} <= HARMLESS | {PAUSE}
+    decided_m, flown_m = metres_after(3, tmp_path / "out", decisions)
+    assert flown_m == pytest.approx(decided_m, rel=0.05)
+    for one in real.uavs:
+        assert f"{one.decided_m:,.0f}" in told and f"{one.flown_m:,.0f}" in told
+    limited = pipeline_folder(tmp_path / "limited", SEED, toml="max_velocity = 11")
+    with serving_edge(AICVDS_MODE="policy") as (url, _):
+        arguments = ("--world", str(limited), "--seed", str(SEED), "--steps", str(STEPS), "--edge", url)
+        assert run("simulate", *arguments, "--out", str(tmp_path / "simulated")).returncode == 0
+    simulated = Summary.model_validate_json((tmp_path / "simulated" / "summary.json").read_bytes())
+    assert real.simulated_lost is not None
+    assert real.simulated_lost <= 1.15 * simulated.lost_packets["aic_vds"]
+
+
+def gap_m(world: Site, uav: int, place: tuple[float, float]) -> float:
+    """The distance of a latitude and longitude from a UAV's trajectory."""
+    assert world.frame is not None
+    x, y = world.frame.metres([place[::-1]])[0].tolist()
+    return trajectories(world.scenario)[uav].locate((x, y))[1]
+
+
+def metres_after(first: int, out: Path, decisions: list[Decision]) -> tuple[float, float]:
+    """The ways decided, and flown by the progress that the UAVs reported, from a step to the last report."""
+    progress: dict[int, dict[int, float]] = {}
+    for request, _ in read_logged_mission(out).decisions:
+        assert request.progress_m is not None
+        progress.setdefault(request.uav_id, {})[request.step] = request.progress_m
+    decided_m = sum(10.0 * d.velocity for d in decisions if first <= d.step < STEPS - 1)
+    return decided_m, sum(own[STEPS - 1] - own[first] for own in progress.values())
 
 
 def check_report(out: Path, decisions: list[Decision], told: str) -> None:

@@ -31,7 +31,7 @@ def mission_in(plan: Path) -> list[Item]:
     return made
 
 
-def pipeline_folder(folder: Path, seed: int, corners: int = 36) -> Path:
+def pipeline_folder(folder: Path, seed: int, corners: int = 36, toml: str | None = None) -> Path:
     """Scenario ``pipeline`` as a world's folder: its sensors for a seed, and its laps as polygons."""
     scenario = scenario_named("pipeline")
     frame = Frame(41.3, 39.9, (scenario.area_m / 2, scenario.area_m / 2))
@@ -46,7 +46,7 @@ def pipeline_folder(folder: Path, seed: int, corners: int = 36) -> Path:
     around = frame.degrees([(-100.0, -100.0), (1100.0, -100.0), (1100.0, 1100.0), (-100.0, 1100.0)]).tolist()
     features.append(feature("fence", "Polygon", [[*around, around[0]]]))
     folder.mkdir(parents=True, exist_ok=True)
-    return write(folder, *features)
+    return write(folder, *features, toml=toml)
 
 
 def starts_m(folder: Path, seed: int) -> list[float]:

@@ -41,10 +41,19 @@ def refused(out: Path, **changes: str | None) -> str:
         ("deadline_ms", "5", "--deadline-ms 5 is not between 10 and 60000"),
         ("radio", "gateway", "--radio gateway: write simulated, or MODULE:NAME of your own"),
         ("mavlink", "nonsense", "--mavlink nonsense: "),
+        ("system_id", "256", "--system-id 256 is not between 1 and 255"),
     ],
 )
 def test_an_option_that_cannot_be_used_is_named(tmp_path: Path, option: str, value: str | None, says: str) -> None:
     assert says in refused(tmp_path, **{option: value})
+
+
+@pytest.mark.parametrize("second", ["udpin://0.0.0.0:14540", "udp://:14540", "udpin://127.0.0.1:14540"])
+def test_two_connections_that_hear_the_same_vehicle_are_refused(tmp_path: Path, second: str) -> None:
+    options = [part for name, value in (GOOD | {"--out": str(tmp_path)}).items() for part in (name, value)]
+    options.insert(2, second)
+    flown = run_here("fly", *options)
+    assert flown.returncode == 2 and "two connections to one place (UDP port 14540) would hear the same" in flown.stderr
 
 
 def test_an_earlier_log_stays(tmp_path: Path) -> None:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import math
-import socket
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from field.errors import VehicleError
-from field.vehicles.field_run import FieldJob, check_uploaded, run_field_mission, wait_for_missions
+from field.vehicles.field_run import FieldJob, run_field_mission
 from field.vehicles.field_uav import FieldUav
 from field.vehicles.mavlink_vehicle import MavlinkVehicle, mavlink_vehicle
 from field.vehicles.simulated_radio import SimulatedRadio
@@ -22,39 +20,18 @@ from simulator.records.decision import Decision
 from simulator.records.mission_logs import read_decisions
 from simulator.records.summary import Summary
 from simulator.sites.files.world_folder import site_from_folder
-from simulator.sites.plans.plan_folder import export_plans
 from tests.conftest import Edge
 from tests.support.airframe import EARTH_M, Item, once
 from tests.support.edge_stub import free_port
+from tests.support.flights import arguments, becomes
 from tests.support.mavsdk_peer import SET_MODE, SPEED, mavsdk_peer
 from tests.support.processes import output_until, run_here, started
-from tests.support.pymavlink_peer import ARDUPILOT, pymavlink_peer
-from tests.support.vehicle_worlds import mission_in
+from tests.support.pymavlink_peer import DEFAULT_SPEED, pymavlink_peer
 from tests.support.waiting import PATIENCE_S, until
 from tests.support.world_folders import EXAMPLE
 
-# A step takes half a second. The patience is for a busy machine; what a slow edge brings is not asked here.
-QUICK = ("--speedup", "20", "--patience-s", "0.45", "--deadline-ms", "400")
 # Beside the two commands, MAVSDK asks for telemetry's rates, for messages once, and for the autopilot's version.
 HARMLESS = {SPEED, SET_MODE, 511, 512, 520}
-
-
-@pytest.fixture(scope="module")
-def missions(tmp_path_factory: pytest.TempPathFactory) -> list[list[Item]]:
-    """What a ground station uploads for the example's three UAVs."""
-    return [mission_in(path) for path in export_plans(EXAMPLE, tmp_path_factory.mktemp("plans"), overwrite=False)]
-
-
-@pytest.fixture
-def port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        return int(taken.getsockname()[1])
-
-
-def arguments(port: int, edge: str, out: Path, *more: str) -> list[str]:
-    connection = ("--mavlink", f"udpin://127.0.0.1:{port}", "--world", str(EXAMPLE))
-    return ["fly", *connection, "--edge", edge, "--mission", "m", "--out", str(out), *QUICK, *more]
 
 
 def patient_job(port: int, edge: str, out: Path, steps: int) -> FieldJob:
@@ -170,95 +147,30 @@ async def test_who_flies_the_vehicle(missions: list[list[Item]], port: int) -> N
         async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
             uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE))
 
-            async def becomes(away: str | None) -> None:
-                async with asyncio.timeout(PATIENCE_S):
-                    while True:
-                        await uav.update(0.1)
-                        if uav.unavailable_reason == away:
-                            return
-                        await asyncio.sleep(0.05)
-
-            await becomes(None)
+            await becomes(uav, None)
             await uav.command(0)
             assert peer.airframe.mode == "hold"
             await uav.command(0)
             await uav.command(9)
-            assert (peer.airframe.mode, peer.airframe.speed) == ("mission", 9.0)
+            # PX4 forgets the speed when its mission becomes active, after both ACKs.
+            await becomes(uav, "it does not fly its mission")
+            await becomes(uav, None)
+            until(lambda: peer.airframe.mode == "mission")
+            assert peer.airframe.speed == DEFAULT_SPEED
+            await uav.correct(0.0, 10.0)
+            assert peer.airframe.speed == 9.0
             commands = once((m.command, m.param2 if m.command == SPEED else m.param3) for _, m in peer.commands())
-            assert commands == [(SET_MODE, 3.0), (SET_MODE, 4.0), (SPEED, 9.0)]
+            assert commands == [(SET_MODE, 3.0), (SET_MODE, 4.0), (SPEED, 9.0), (SPEED, 9.0)]
             count = len(peer.commands())
             peer.airframe.drift_m = 150.0
-            await becomes("it is off its path")
+            await becomes(uav, "it is off its path")
             peer.airframe.drift_m = 0.0
-            await becomes(None)
+            await becomes(uav, None)
             peer.airframe.mode = "hold"
-            await becomes("it does not fly its mission")
+            await becomes(uav, "it does not fly its mission")
             peer.airframe.mode = "land"
-            await becomes("it lands")
+            await becomes(uav, "it lands")
             assert uav.landed and len(peer.commands()) == count
-
-
-async def becomes(uav: FieldUav, away: str | None) -> None:
-    async with asyncio.timeout(PATIENCE_S):
-        while True:
-            await uav.update(0.1)
-            if uav.unavailable_reason == away:
-                return
-            await asyncio.sleep(0.05)
-
-
-@pytest.mark.parametrize("answers", [True, False], ids=["acknowledged", "not answered"])
-async def test_an_ardupilot_is_asked_for_its_position_and_again_after_a_gap(
-    missions: list[list[Item]], port: int, answers: bool
-) -> None:
-    with pymavlink_peer(missions[0], port, autopilot=ARDUPILOT) as peer:
-        peer.answers_requests = answers
-        async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
-            uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE))
-            await becomes(uav, None)
-            # It has started anew, and sends heartbeats alone until it is asked again.
-            peer.streams.clear()
-            peer.obeys_requests = False
-            await becomes(uav, "its heartbeat arrives, but no position, which was asked for")
-            assert not uav.landed
-            peer.obeys_requests = True
-            await becomes(uav, None)
-
-
-async def test_an_autopilot_that_streams_is_asked_for_nothing(missions: list[list[Item]], port: int) -> None:
-    with pymavlink_peer(missions[0], port) as peer:
-        async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
-            await becomes(FieldUav(0, vehicle, site_from_folder(EXAMPLE)), None)
-        asked = [m for _, m in peer.received if m.get_type() == "COMMAND_LONG" and m.command == 511]
-        assert all(m.param1 != 33 for m in asked)
-
-
-async def test_decisions_begin_at_the_height_of_the_path_or_on_the_way(missions: list[list[Item]], port: int) -> None:
-    with pymavlink_peer(missions[0], port, autopilot=ARDUPILOT) as peer:
-        peer.airframe.climbs_m = 0.0
-        async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
-            uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE), height_m=100.0)
-            await becomes(uav, "it is on the ground")
-            peer.airframe.climbs_m = 6.0
-            await becomes(uav, "it climbs to 100 m")
-            with pytest.raises(VehicleError, match="does not fly its mission: it climbs"):
-                await wait_for_missions([uav], wait_s=0.3)
-            peer.airframe.climbs_m = 92.0
-            await becomes(uav, None)
-            # A descent on the way is none to the ground.
-            peer.airframe.climbs_m = 30.0
-            await asyncio.sleep(0.2)
-            await becomes(uav, None)
-            low = FieldUav(0, vehicle, site_from_folder(EXAMPLE), height_m=math.inf)
-            await becomes(low, "it climbs")
-            peer.airframe.climbs_m, peer.airframe.speed = None, 50.0
-            await becomes(low, None)
-
-
-async def test_the_home_of_ardupilot_is_no_part_of_the_mission(missions: list[list[Item]], port: int) -> None:
-    with pymavlink_peer(missions[0], port, autopilot=ARDUPILOT):
-        async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
-            check_uploaded(await vehicle.mission(), site_from_folder(EXAMPLE), 0, vehicle.name)
 
 
 def test_sigterm_leaves_the_vehicle_on_its_mission(
