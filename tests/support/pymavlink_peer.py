@@ -27,8 +27,8 @@ POSITION, LANDED = mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, mavlink.MAVLINK_M
 PX4, ARDUPILOT = mavlink.MAV_AUTOPILOT_PX4, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
 # PX4: main mode AUTO, and its sub-modes.
 AUTO, SUB_MODES = 4, {"hold": 3, "mission": 4, "return": 5, "land": 6}
-# ArduCopter's modes LOITER, AUTO, RTL and LAND.
-COPTER_MODES = {"hold": 5, "mission": 3, "return": 6, "land": 9}
+# ArduCopter's modes BRAKE, which MAVSDK asks for as mode hold, AUTO, RTL and LAND.
+COPTER_MODES = {"hold": 17, "mission": 3, "return": 6, "land": 9}
 # The speed of a mission that has just become active, m/s, and PX4's delay until then.
 DEFAULT_SPEED, ACTIVATES_S = 5.0, 0.3
 # A ground station's system ID, the only one beside its own that an ArduPilot with MAV_OPTIONS obeys.
