@@ -184,6 +184,9 @@ class RecedingHorizon:
         """
         belief, step, world = self._belief, self.step, self._scenario
         present = [uav for uav in belief.present(step) if belief.uavs[uav].progress_m is not None]
+        for uav, fastest in belief.drift.tops.items():
+            if uav in self.plans:
+                self.plans[uav] = np.minimum(self.plans[uav], [world.sensors, fastest])
         free = [uav for uav in (present if self._joint else uavs) if uav in present]
         if not set(uavs) & set(free):
             return None

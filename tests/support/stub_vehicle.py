@@ -33,13 +33,14 @@ class StubVehicle:
     Attributes:
         commands: every command.
         lands_at_s: from then on it lands.
+        top: its highest ground speed, m/s, whatever it acknowledges.
         shift_m: how far north of its path it reports itself.
     """
 
     def __init__(self, site: Site, uav: int, clock: SimulatedClock, wind: float = 1.0) -> None:
         self.name = f"stub {uav}"
         self.commands: list[str | float] = []
-        self.lands_at_s = float("inf")
+        self.lands_at_s = self.top = float("inf")
         self.shift_m = 0.0
         self.deaf = self.waits_in_mission = False
         self.mode: FlightMode = "mission"
@@ -53,7 +54,8 @@ class StubVehicle:
         assert self._site.frame is not None
         x, y = self._path.at(self.flown_m).tolist()
         longitude, latitude = self._site.frame.degrees([(x, y + self.shift_m)])[0].tolist()
-        state = VehicleState(True, True, self.mode, (longitude, latitude), 100.0)
+        speed = self._ground_speed if self.mode == "mission" else 0.0
+        state = VehicleState(True, True, self.mode, (longitude, latitude), 100.0, speed_m_s=speed)
         return replace(state, mode="landing") if self._clock.now() >= self.lands_at_s else state
 
     async def mission(self) -> list[MissionItem]:
@@ -75,6 +77,10 @@ class StubVehicle:
         self._obey("resume")
         self.mode = "mission"
 
+    @property
+    def _ground_speed(self) -> float:
+        return min(self._speed * self._wind, self.top)
+
     def _obey(self, command: str | float) -> None:
         self._advance()
         self.commands.append(command)
@@ -83,5 +89,5 @@ class StubVehicle:
 
     def _advance(self) -> None:
         if self.mode == "mission":
-            self.flown_m += self._speed * self._wind * (self._clock.now() - self._at_s)
+            self.flown_m += self._ground_speed * (self._clock.now() - self._at_s)
         self._at_s = self._clock.now()

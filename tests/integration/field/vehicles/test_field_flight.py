@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -158,6 +159,26 @@ async def test_the_progress_flown_counts_not_the_speed_commanded() -> None:
     await uav.update(2.0)
     assert vehicle.commands == [6.0, 6.75, 7.88, 9.84, 14.0]
     assert uav.flown_m == pytest.approx(6.0 + 6.75 + 7.88 + 9.84 + 14.0, abs=0.1)
+
+
+async def test_the_edge_decides_no_velocity_that_an_airframe_was_seen_not_to_reach(edge: Edge) -> None:
+    trial, url = Trial(), str(edge(mode="policy").base_url)
+    for vehicle in trial.vehicles[:2]:
+        vehicle.top = 8.97
+    flown = await trial.fly(url)
+    limited = [d for d in flown.decisions if d.uav_id < 2]
+    assert max(d.velocity for d in limited if d.step == 0) > 9 and {d.source for d in limited} == {"policy"}
+    seen = {r.uav_id: r.step for r in reversed(trial.requests) if r.top_speed_mps is not None}
+    assert seen[0] <= 2 and seen[1] <= 2 and 2 not in seen
+    assert all(r.top_speed_mps in (None, 8.97) for r in trial.requests)
+    assert max(d.velocity for d in limited if d.step >= 2) == 9
+    assert max(d.velocity for d in flown.decisions if d.uav_id == 2 and d.step >= 2) > 9
+    path = trajectories(trial.site.scenario)[0]
+    reports = {r.step: r.progress_m or 0.0 for r in trial.requests if r.uav_id == 0}
+    for d in limited:
+        if d.uav_id == 0 and 2 <= d.step < STEPS - 1:
+            flown_m = math.remainder(reports[d.step + 1] - reports[d.step], path.length_m)
+            assert flown_m == pytest.approx(10.0 * d.velocity, rel=0.05, abs=1.0)
 
 
 class Counting:

@@ -63,3 +63,20 @@ def test_a_restored_drift_goes_on_as_it_was() -> None:
     again.load_state_dict(drift.state_dict())
     np.testing.assert_array_equal(drift.wind, again.wind)
     assert isinstance(LAP, Circle)
+
+
+def test_top_speeds_are_kept_and_a_short_way_of_such_an_airframe_says_nothing_of_the_wind() -> None:
+    drift, again = Drift(), Drift()
+    assert drift.fastest([0, 1], 14) == 14
+    drift.tops = {0: 9, 1: 11}
+    assert [drift.fastest(uavs, 14) for uavs in ([0], [0, 1], [1, 2], [])] == [9, 11, 14, 14]
+    drift.learn(LAP, 0.0, 10.0, 35.0)
+    assert drift.none
+    drift.learn(LAP, 0.0, 100.0, 60.0)
+    assert not drift.none
+    again.load_state_dict(drift.state_dict())
+    assert again.tops == {0: 9, 1: 11}
+    earlier = drift.state_dict()
+    del earlier["tops"]
+    again.load_state_dict(earlier)
+    assert again.tops == {}

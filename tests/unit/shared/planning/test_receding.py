@@ -98,3 +98,11 @@ def test_a_uav_with_nothing_in_reach_names_the_nearest_sensor_that_is_free() -> 
     assert horizon.action(0) == (3, 5) and horizon.action(0, {3}) is None
     horizon.begin(1)
     assert horizon.action(0) is None
+
+
+def test_no_plan_flies_faster_than_the_fleets_airframes() -> None:
+    horizon = heard(50.0)
+    assert planned(horizon).actions[:, :, 1].max() > 8
+    horizon._belief.drift.tops = {0: 8, 1: 7, 2: 8}
+    assert planned(horizon).actions[:, :, 1].max() == 8
+    assert all(actions[:, 1].max() <= 8 for actions in horizon.plans.values())
