@@ -56,8 +56,8 @@ def test_real_uavs_claim_only_what_they_heard(flight: Flight, tmp_path: Path) ->
     simulated = summary_of(flight, None)
     assert "real_uavs" not in simulated.model_dump_json() and late_text(simulated) is None
     real = RealUavs(
-        uavs=sums_by_uav(flight.decisions), late=2, undecided={"it lands": 3}, not_carried_out=["UAV 1 denied"],
-        simulated_lost=None,
+        uavs=sums_by_uav(flight.decisions, {0: (1610.0, 1316.0)}), late=2, undecided={"it lands": 3},
+        not_carried_out=["UAV 1 denied"], simulated_lost=None, ended={1: "it lands"}, warnings=["UAV 2: it waits"],
     )  # fmt: skip
     changes = {
         "real_uavs": real,
@@ -81,6 +81,9 @@ def test_real_uavs_claim_only_what_they_heard(flight: Flight, tmp_path: Path) ->
         "lost packets heard of",
         "Late: 2 decisions",
         "3 waypoints without a decision: it lands",
+        "UAV 1 did not fly its mission at the end: it lands.",
+        "Warning: UAV 0 flew 1,316 m where 1,610 m were decided.",
+        "Warning: UAV 2: it waits.",
     ):
         assert text in shown
     assert "1 commands not carried out; the last: UAV 1 denied." in shown and "simulated sensors" not in shown
