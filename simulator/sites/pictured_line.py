@@ -19,11 +19,12 @@ def chained(parts: Sequence[FloatArray]) -> tuple[FloatArray, float]:
     """
     if not parts:
         return np.empty((0, 2)), 0.0
-    ends = np.array([(part[0], part[-1]) for part in parts])
+    # As complex numbers distances take a fraction of the time.
+    ends = np.array([(complex(*part[0]), complex(*part[-1])) for part in parts])
     line, widest = deque([parts[0]]), 0.0
     ends[0] = np.inf
     for _ in parts[1:]:
-        gaps = np.stack([np.linalg.norm(ends - at, axis=2) for at in (line[0][0], line[-1][-1])])
+        gaps = np.stack([np.abs(ends - complex(*at)) for at in (line[0][0], line[-1][-1])])
         after, index, last = (int(at) for at in np.unravel_index(np.argmin(gaps), gaps.shape))
         widest = max(widest, float(gaps[after, index, last]))
         part = parts[index] if after != last else parts[index][::-1]

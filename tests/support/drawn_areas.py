@@ -35,6 +35,8 @@ def breach_m(site: Site, features: list[Json], samples: int = 97) -> float:
 def _depth_m(feature: Json, longitude: float, latitude: float) -> float:
     """The distance of a place from the area's boundary, metres; negative outside."""
     kind, drawn = feature["geometry"]["type"], feature["geometry"]["coordinates"]
+    if kind.startswith("Multi"):
+        kind, drawn = kind.removeprefix("Multi"), drawn[0]
     if kind == "Point":
         return float(feature["properties"]["radius_m"] - _EARTH.inv(longitude, latitude, *drawn)[2])
     across = math.cos(math.radians(latitude))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from simulator.errors import UsageError
 from simulator.flying.rollout import rollout
 from simulator.policies.registry import policy_named
 from simulator.sites.files.world_folder import site_from_folder
+from tests.support.drawn_areas import breach_m
 from tests.support.world_folders import (
     GOOD,
     RING,
@@ -231,18 +233,31 @@ def test_more_arrivals_than_a_world_may_draw(tmp_path: Path) -> None:
 # ---- any content
 
 
+AROUND = [[41.4, 39.9], [41.6, 39.9], [41.6, 40.1], [41.4, 40.1], [41.4, 39.9]]
+FENCES = (feature("fence", "Polygon", [AROUND]), feature("no_fly", "Point", [41.52, 39.95], radius_m=900.0))
+# Lines of kilometres that are straight in degrees may be this far from that, metres.
+STRAIGHT_M = 1.5
+
+
 def fuzzed(folder: Path, change: Callable[[Path], object]) -> None:
-    """Read a world after a change: it gives a site that can be flown, or a ``UsageError``."""
+    """Read a world after a change: it has whatever was drawn and flies inside its fences, or is a ``UsageError``."""
     for name in ("scenario.toml", "arrivals.csv", "gains.csv"):
         (folder / name).unlink(missing_ok=True)
-    write(folder, *GOOD)
+    write(folder, *GOOD, *FENCES)
     change(folder)
     try:
         site = site_from_folder(folder, steps=2)
     except UsageError as error:
         assert str(error) and "\n" not in str(error)
         return
-    assert site.scenario.sensors * site.scenario.uavs > 0
+    drawn = json.loads((folder / "world.geojson").read_text(encoding="utf-8-sig"))["features"]
+    roles = Counter(feature["properties"]["role"] for feature in drawn)
+    assert (site.scenario.sensors, site.scenario.uavs) == (roles["sensor"], roles["trajectory"])
+    assert [fence.role for fence in site.fences] == [
+        role for role in (feature["properties"]["role"] for feature in drawn) if role in ("fence", "no_fly")
+    ]
+    assert bool(site.scenario.pipeline) == ("pipeline" in roles)
+    assert breach_m(site, drawn) <= STRAIGHT_M
     if site.scenario.queue_capacity < 1000:
         rollout(site.world(), policy_named("eof"), seed=0)
 
@@ -264,23 +279,31 @@ geometries = st.one_of(
 )
 features = st.builds(
     feature,
-    st.sampled_from(["sensor", "trajectory", "pipeline", None]),
-    st.sampled_from(["Point", "LineString", "Polygon", "MultiPoint"]),
+    st.sampled_from(["sensor", "trajectory", "pipeline", "no_fly", "fence", None]),
+    st.sampled_from(["Point", "LineString", "Polygon", "MultiPoint", "MultiLineString"]),
     geometries | anything,
     id=st.text(max_size=3) | anything,
+    radius_m=st.none() | st.floats(1.0, 2e4) | scalars,
+)
+# Some of them leave the fence, or enter the no_fly area.
+ways = st.builds(
+    lambda places: feature("trajectory", "LineString", [list(place) for place in places]),
+    st.lists(st.tuples(st.floats(41.38, 41.62), st.floats(39.88, 40.12)), min_size=2, max_size=4),
 )
 quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @quick
-@given(extra=st.lists(features | anything, max_size=4), members=st.dictionaries(st.just("crs"), anything))
-def test_any_features_make_a_site_or_a_usage_error(tmp_path: Path, extra: list[Any], members: Json) -> None:
-    fuzzed(tmp_path, lambda folder: write(folder, *GOOD[:2], *extra, *GOOD[2:], **members))
+@given(extra=st.lists(ways | features | anything, max_size=4), members=st.dictionaries(st.just("crs"), anything))
+def test_any_features_make_a_world_inside_its_fences_or_a_usage_error(
+    tmp_path: Path, extra: list[Any], members: Json
+) -> None:
+    fuzzed(tmp_path, lambda folder: write(folder, *GOOD[:2], *extra, *GOOD[2:], *FENCES, **members))
 
 
 @quick
 @given(content=st.binary(max_size=60) | anything.map(lambda value: json.dumps(value).encode()))
-def test_any_bytes_make_a_site_or_a_usage_error(tmp_path: Path, content: bytes) -> None:
+def test_any_bytes_make_a_world_inside_its_fences_or_a_usage_error(tmp_path: Path, content: bytes) -> None:
     for name in ("world.geojson", "scenario.toml", "arrivals.csv", "gains.csv"):
         fuzzed(tmp_path, lambda folder, name=name: (folder / name).write_bytes(content))  # type: ignore[misc]
 
@@ -293,13 +316,13 @@ def test_any_bytes_make_a_site_or_a_usage_error(tmp_path: Path, content: bytes) 
     | st.integers().map(str)
     | st.just(hex(10**5000)),
 )
-def test_any_override_makes_a_site_or_a_usage_error(tmp_path: Path, key: str, value: str) -> None:
+def test_any_override_makes_a_world_inside_its_fences_or_a_usage_error(tmp_path: Path, key: str, value: str) -> None:
     fuzzed(tmp_path, lambda folder: (folder / "scenario.toml").write_text(f"{key} = {value}\n"))
 
 
 @quick
 @given(cells=st.lists(st.lists(st.text(max_size=4) | st.integers().map(str), min_size=2, max_size=3), max_size=4))
-def test_any_cells_make_a_site_or_a_usage_error(tmp_path: Path, cells: list[list[str]]) -> None:
+def test_any_cells_make_a_world_inside_its_fences_or_a_usage_error(tmp_path: Path, cells: list[list[str]]) -> None:
     out = io.StringIO()
     csv.writer(out, escapechar="\\").writerows([["step", "a", "b"], *([t, *row] for t, row in enumerate(cells))])
     text = out.getvalue().encode("utf-8", errors="surrogatepass")
@@ -310,7 +333,7 @@ def test_any_cells_make_a_site_or_a_usage_error(tmp_path: Path, cells: list[list
 @given(
     rows=st.lists(st.lists(st.sampled_from(["0", "a", "b", "9.5", ""]) | st.text(max_size=4), max_size=5), max_size=4)
 )
-def test_any_gains_make_a_site_or_a_usage_error(tmp_path: Path, rows: list[list[str]]) -> None:
+def test_any_gains_make_a_world_inside_its_fences_or_a_usage_error(tmp_path: Path, rows: list[list[str]]) -> None:
     out = io.StringIO()
     csv.writer(out, escapechar="\\").writerows([POINTS.strip().split(","), *rows])
     text = out.getvalue().encode("utf-8", errors="surrogatepass")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
+from itertools import pairwise
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
@@ -11,7 +14,7 @@ import pytest
 from pyproj import Geod
 
 from shared.world.scenario import Scenario
-from shared.world.trajectory import trajectories
+from shared.world.trajectory import Polyline, trajectories
 from simulator.commands.options import site_from_options
 from simulator.errors import UsageError
 from simulator.flying.rollout import rollout
@@ -91,9 +94,129 @@ def test_altitudes_are_left_out_and_foreign_members_ignored(tmp_path: Path) -> N
     assert site_from_folder(write(tmp_path, GOOD[0], high, GOOD[2], name="x", bbox=[9, 9, 0, 0])).scenario == flat
 
 
-@pytest.mark.parametrize("name", ["urn:ogc:def:crs:OGC:1.3:CRS84", "EPSG:4326"])
-def test_a_crs_member_may_name_the_default(tmp_path: Path, name: str) -> None:
-    site_from_folder(write(tmp_path, *GOOD, crs={"type": "name", "properties": {"name": name}}))
+@pytest.mark.parametrize(
+    "named",
+    [
+        *({"name": name} for name in (
+            "urn:ogc:def:crs:OGC:1.3:CRS84", "EPSG:4326", "epsg:4326", "urn:ogc:def:crs:EPSG::4326", "OGC:CRS84",
+            "urn:x-ogc:def:crs:EPSG:6.9:4326", "http://www.opengis.net/def/crs/EPSG/0/4326", "CRS:84", "CRS84",
+            "https://www.opengis.net/def/crs/OGC/1.3/CRS84", "http://www.opengis.net/gml/srs/epsg.xml#4326", "WGS 84",
+        )),
+        {"code": 4326},
+        {"href": "http://spatialreference.org/ref/epsg/4326/proj4/"},
+    ],
+)  # fmt: skip
+def test_a_crs_member_may_name_the_default(tmp_path: Path, named: dict[str, Any]) -> None:
+    site_from_folder(write(tmp_path, *GOOD, crs={"type": "name", "properties": named}))
+
+
+def test_a_whole_float_is_an_id_and_names_of_others_may_be_long(tmp_path: Path) -> None:
+    number = feature("sensor", "Point", [41.5, 39.95], id=7.0, name="x" * 88)
+    line = feature("trajectory", "LineString", [[41.5, 39.95], [41.51, 39.955]], name="x" * 88, id=7.5)
+    assert site_from_folder(write(tmp_path, number, line)).sensor_names == ("7",)
+
+
+def test_a_multi_geometry_of_one_part_is_that_part(tmp_path: Path) -> None:
+    plain = (*GOOD, feature("no_fly", "Polygon", [[[x + 0.1, y] for x, y in RING]]))
+    expected = site_from_folder(write(tmp_path, *plain))
+    shapes = [one["geometry"] for one in plain]
+    parts = [{"type": f"Multi{shape['type']}", "coordinates": [shape["coordinates"]]} for shape in shapes]
+    multi = [{**one, "geometry": part} for one, part in zip(plain, parts, strict=True)]
+    site = site_from_folder(write(tmp_path, *multi))
+    assert (site.scenario, site.fences) == (expected.scenario, expected.fences)
+
+
+def test_a_line_cut_at_the_antimeridian_is_one(tmp_path: Path) -> None:
+    """As RFC 7946 has lines that cross it."""
+    cut = feature(
+        "trajectory", "MultiLineString", [[[179.99, -17], [180, -17.005]], [[-180, -17.005], [-179.99, -17.01]]]
+    )
+    [route] = site_from_folder(write(tmp_path, sensor("a", 180.0, -17.0), cut)).scenario.routes
+    assert len(route) == 3 and max(math.dist(*leg) for leg in pairwise(route)) < 1300
+
+
+@pytest.mark.parametrize(
+    "length", [pytest.param(1_017, id="the real pipeline that was refused"), pytest.param(20_000, id="a longer one")]
+)
+def test_a_long_pipeline_is_simplified(tmp_path: Path, length: int) -> None:
+    bends = [[41.5 + 1e-6 * k, 39.95 + 1e-3 * math.sin(k / length * 20)] for k in range(length)]
+    scenario = site_from_folder(write(tmp_path, *GOOD, feature("pipeline", "LineString", bends))).scenario
+    drawn = np.array(scenario.pipeline)
+    assert len(drawn) == 1000
+    frame = site_from_folder(tmp_path).frame
+    assert frame is not None
+    truly = frame.metres(bends)
+    np.testing.assert_allclose(drawn[[0, -1]], truly[[0, -1]], atol=0.001)
+    line = Polyline(drawn)
+    assert max(line.locate((x, y))[1] for x, y in truly[:: length // 100].tolist()) < 0.5
+
+
+def test_the_parts_of_a_pipeline_are_joined_end_to_end(tmp_path: Path) -> None:
+    parts = [[[41.5 + k * 1e-5, 39.95], [41.5 + (k + 1) * 1e-5, 39.95]] for k in range(1483)]
+    shuffled = [part[:: 1 - 2 * (k % 2)] for k, part in enumerate(Random(1).sample(parts, len(parts)))]
+    warnings: list[str] = []
+    halves = [feature("pipeline", "MultiLineString", half) for half in (shuffled[:700], shuffled[700:])]
+    scenario = site_from_folder(write(tmp_path, *GOOD, *halves), on_warning=warnings.append).scenario
+    assert len(scenario.pipeline) == 1000 and not warnings
+    assert Polyline(scenario.pipeline).length_m / 2 == pytest.approx(1483 * 0.8547, rel=0.001)
+
+
+def test_a_pipeline_with_gaps_is_joined_and_said(tmp_path: Path) -> None:
+    parts = [[[41.5 + 0.002 * k, 39.95], [41.501 + 0.002 * k, 39.95]] for k in range(3)]
+    warnings: list[str] = []
+    site_from_folder(write(tmp_path, *GOOD, feature("pipeline", "MultiLineString", parts)), on_warning=warnings.append)
+    assert ["the pipeline's parts are up to 85 m apart; pictures show them joined" in text for text in warnings] == [
+        True
+    ]
+
+
+@pytest.mark.parametrize("length", [2.8, 9.0])
+def test_a_long_line_is_straight_in_degrees(tmp_path: Path, length: float) -> None:
+    """A parallel's 200 and 640 km: straight in the plane they are 900 m and 9 km off."""
+    line = there_and_back([10.0, 50.0], [10.0 + length, 50.0])
+    site = site_from_folder(write(tmp_path, sensor("a", 10.0, 50.0), line))
+    assert site.frame is not None
+    [path] = trajectories(site.scenario)
+    for place in site.frame.metres([[10.0 + length * share, 50.0] for share in np.linspace(0, 1, 41)]).tolist():
+        assert path.locate(tuple(place))[1] < 0.6
+
+
+def test_a_fence_is_straight_in_degrees_too(tmp_path: Path) -> None:
+    """A line 300 m south of a parallel of 200 km is clear of the area north of it, and 300 m north is in it."""
+    area = feature("no_fly", "Polygon", [[[10, 50], [12.8, 50], [12.8, 50.5], [10, 50.5], [10, 50]]])
+    clear = there_and_back([10.0, 49.9973], [12.8, 49.9973])
+    site_from_folder(write(tmp_path, sensor("a", 10.0, 50.0), clear, area))
+    with pytest.raises(UsageError, match="enters the no_fly area"):
+        site_from_folder(
+            write(tmp_path, sensor("a", 10.0, 50.0), there_and_back([11.3, 50.0027], [11.5, 50.0027]), area)
+        )
+
+
+@pytest.mark.parametrize(
+    ("ring", "complaint"),
+    [
+        ([[-180, -90], [180, -90], [180, 90], [-180, 90]], "the fence is more than 2,000 km away; draw it nearer"),
+        (
+            [[-180, 80], [180, 80], [180, 90], [-180, 90]],
+            "an edge goes around the Earth; give it corners that are near",
+        ),
+        (
+            [[-179, 80], [179, 80], [179, 90], [-179, 90]],
+            "an edge goes around the Earth; give it corners that are near",
+        ),
+    ],
+)
+def test_an_area_around_the_earth_is_refused(tmp_path: Path, ring: list[list[float]], complaint: str) -> None:
+    area = feature("no_fly", "Polygon", [[*ring, ring[0]]])
+    line = there_and_back([10.0, 85.0], [10.1, 85.0])
+    with pytest.raises(UsageError, match=complaint):
+        site_from_folder(write(tmp_path, sensor("a", 10.0, 85.0), line, area))
+
+
+def test_too_many_waypoints_between_are_refused(tmp_path: Path) -> None:
+    line = there_and_back(*[[10.0, 50.0], [12.8, 50.0]] * 40)
+    with pytest.raises(UsageError, match="straight in degrees, are 5,057 waypoints in metres, at most 1,000; shorten"):
+        site_from_folder(write(tmp_path, sensor("a", 10.0, 50.0), line))
 
 
 def test_an_id_may_be_a_number_a_name_or_the_features_own(tmp_path: Path) -> None:
