@@ -20,7 +20,7 @@ from simulator.sites.files.reading import quoted
 from simulator.sites.files.recordings import read_gains, read_trace
 from simulator.sites.files.survey import MAX_WAYPOINTS, Survey, check_complete, read_survey
 from simulator.sites.pictured_line import chained, simplified
-from simulator.sites.projection import Frame, centre_of, fit_square, to_metres
+from simulator.sites.projection import Frame, centre_of, fit_square
 from simulator.sites.site import Site
 
 __all__ = ["ARRIVALS", "FEATURES", "GAINS", "OVERRIDES", "site_from_folder"]
@@ -92,9 +92,10 @@ def placed_features(
     """
     drawn = [*survey.trajectories.values(), *survey.pipeline]
     degrees = [*survey.sensors.values(), *(point for line in drawn for point in line)]
-    _check_extent(path, to_metres(degrees))
     plane = Frame(*centre_of(degrees), (0.0, 0.0))
+    _check_extent(path, plane.metres(degrees))
     lines = [np.array(list(survey.sensors.values())).reshape(-1, 2), *map(plane.bent, drawn)]
+    # To the millimetre, which is the same to the bit with another version of the projection's library.
     projected = np.round(plane.metres(np.concatenate(lines)), 3)
     _check_extent(path, projected)
     metres, side = fit_square(projected)

@@ -20,7 +20,7 @@ from simulator.errors import UsageError
 from simulator.flying.rollout import rollout
 from simulator.policies.registry import policy_named
 from simulator.sites.files.world_folder import site_from_folder
-from simulator.sites.projection import to_metres
+from simulator.sites.projection import Frame, centre_of
 from simulator.sites.site import Site
 from tests.support.world_folders import (
     EXAMPLE,
@@ -75,7 +75,7 @@ def test_lengths_are_those_on_the_ellipsoid(centre: tuple[float, float], apart: 
     """The accuracy in the projection's docstring, also across the antimeridian and near a pole."""
     east, north, _ = EARTH.fwd([centre[0]] * 8, [centre[1]] * 8, np.arange(8) * 45.0, [apart * 1e5] * 8)
     points = np.stack((east, north), axis=-1)
-    plane = to_metres(points)
+    plane = Frame(*centre_of(points), (0.0, 0.0)).metres(points)
     for here, there, a, b in zip(points, np.roll(points, 1, 0), plane, np.roll(plane, 1, 0), strict=True):
         true_m = EARTH.inv(*here, *there)[2]
         assert np.hypot(*(a - b)) == pytest.approx(true_m, rel=worst, abs=0.01)
