@@ -79,6 +79,7 @@ def configure(level: str, form: Literal["text", "json"]) -> None:
         structlog.stdlib.ExtraAdder(),
         structlog.processors.TimeStamper(fmt="iso", utc=True),
         _without_colours,
+        _on_one_line,
     ]
     renderers: list[Processor] = (
         [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
@@ -103,6 +104,14 @@ def configure(level: str, form: Literal["text", "json"]) -> None:
 def _without_colours(_: object, __: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
     """Drop uvicorn's second copy of its message, which has a terminal's colour codes."""
     event.pop("color_message", None)
+    return event
+
+
+def _on_one_line(_: object, __: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
+    """Escape what would begin a line of its own or command a terminal: words of clients and LLMs are in the log too."""
+    for name, value in event.items():
+        if isinstance(value, str) and not value.isprintable():
+            event[name] = "".join(c if c.isprintable() else repr(c)[1:-1] for c in value.strip())
     return event
 
 
