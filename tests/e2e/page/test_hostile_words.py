@@ -58,7 +58,12 @@ def harmless(page: Page) -> None:
     """Nothing ran, nothing became an element, and the page is as wide as its window."""
     assert page.evaluate("window.hacked") is None
     assert page.locator("img[src=x], td script, p script, dd script, [onerror], [onload]").count() == 0
-    assert page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth") <= 0
+    wide = page.evaluate(
+        """() => [...document.body.querySelectorAll("*")].filter(one => !one.closest(".scroll, .card, svg, canvas") &&
+        one.getBoundingClientRect().right > innerWidth + 1).map(one => one.outerHTML.slice(0, 99))"""
+    )
+    over = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+    assert over <= 0, wide
 
 
 @pytest.mark.parametrize("width", WIDTHS)
