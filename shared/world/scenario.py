@@ -148,6 +148,8 @@ SCENARIOS: dict[str, Scenario] = {
     s.name: s
     for s in (
         Scenario(),
+        # Of the settings of the claims map, the one in which most of the paper's statements hold.
+        Scenario(name="paper_light", arrival_rate_min=0.2, arrival_rate_max=0.8, initial_queue_min=0.9, step_s=20.0),
         Scenario(name="pipeline", layout="pipeline"),
         Scenario(name="stress", link_share=0.35, arrival_rate_min=4.0, arrival_rate_max=12.0),
         Scenario(name="dense", sensors=100, uavs=10),

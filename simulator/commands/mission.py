@@ -33,7 +33,7 @@ class Create:
     world: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
     """A folder with world.geojson and, optionally, scenario.toml and arrivals.csv, as examples/pipeline_world."""
     scenario: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """A ready-made world instead: paper (the default), pipeline, stress, dense or lossy_uplink."""
+    """A ready-made world instead: paper (the default), paper_light, pipeline, stress, dense or lossy_uplink."""
     mission: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
     """The mission's ID. Default: a new one, such as pipeline_world-0-1f6c09ab."""
     mode: Annotated[Mode | None, arg(metavar="guided|llm|value|policy", help_behavior_hint="")] = None

@@ -23,10 +23,10 @@ class WorldOptions:
     """The options that name a world, as :func:`site_of` reads them."""
 
     scenario: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """A ready-made world: paper (10 sensors, 3 UAVs, 30 steps; the default), pipeline (sensors in a line), stress
-    (weak link), dense (100 sensors, 10 UAVs) or lossy_uplink (a tenth of the requests lost). In the other six the world
-    differs from the edge's model: shadowed (links 8 dB off), fading, bursty (arrivals), windy, faulty (dead radios, a
-    UAV gone, half of the rate lost) and field (all of it, mild)."""
+    """A ready-made world: paper (10 sensors, 3 UAVs, 30 steps; the default), paper_light (a tenth of its arrivals, full
+    queues), pipeline (sensors in a line), stress (weak link), dense (100 sensors, 10 UAVs) or lossy_uplink (a tenth of
+    the requests lost). In the other six the world differs from the edge's model: shadowed (links 8 dB off), fading,
+    bursty (arrivals), windy, faulty (dead radios, a UAV gone, half of the rate lost) and field (all of it, mild)."""
     world: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
     """A world of your own, instead of --scenario: a folder with world.geojson (sensors, trajectories) and, optionally,
     scenario.toml (other numbers), arrivals.csv (recorded traffic) and gains.csv (recorded links).

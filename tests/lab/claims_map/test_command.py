@@ -65,6 +65,8 @@ def test_the_settings_vary_what_the_paper_leaves_open() -> None:
     assert {point.row for point in found} == set(points.ROWS)
     paper = next(p for p in found if (p.row, p.rate) == ("queues 0.3 to 1 W", 5.0))
     assert paper.scenario == SCENARIOS["paper"]
+    light = next(p for p in found if (p.row, p.rate) == ("step 20 s", 0.5))
+    assert light.scenario.model_copy(update={"name": "paper_light"}) == SCENARIOS["paper_light"]
 
 
 def test_bad_use_is_refused() -> None:

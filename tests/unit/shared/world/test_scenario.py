@@ -14,7 +14,7 @@ UNMODELLED = ["shadowed", "fading", "bursty", "windy", "faulty", "field"]
 
 
 def test_presets_are_named_as_they_are_filed() -> None:
-    assert list(SCENARIOS) == ["paper", "pipeline", "stress", "dense", "lossy_uplink", *UNMODELLED]
+    assert list(SCENARIOS) == ["paper", "paper_light", "pipeline", "stress", "dense", "lossy_uplink", *UNMODELLED]
     assert all(scenario_named(name).name == name for name in SCENARIOS)
 
 
@@ -26,7 +26,7 @@ def test_paper_has_the_papers_numbers() -> None:
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(ValueError, match="unknown scenario 'mars': choose one of paper, pipeline, stress"):
+    with pytest.raises(ValueError, match="unknown scenario 'mars': choose one of paper, paper_light, pipeline"):
         scenario_named("mars")
 
 
