@@ -42,6 +42,8 @@ BY_K = {
     "k = 7": (chooser_name("random", 7), GREEN, "--"),
     "all sensors": (EVERY_SENSOR, ORANGE, ":"),
 }
+# Three labels of fewer letters fit side by side.
+_SHORT_LABEL = 12
 Looks = Mapping[str, tuple[str, str, object]]
 Rows = Sequence[Sequence[object]]
 
@@ -84,7 +86,8 @@ def losses(folder: Folder, name: str, looks: Looks, flights: Mapping[str, Flown]
         panel.set_ylabel("lost packets")
         panel.set_ylim(bottom=0)
         panel.xaxis.set_major_locator(MaxNLocator(integer=True))
-        picture.legend(loc="outside upper center", ncols=3, frameon=False)
+        columns = 3 if max(map(len, found)) < _SHORT_LABEL else 2
+        picture.legend(loc="outside upper center", ncols=columns, frameon=False)
 
     folder.figure(name, (SINGLE_IN, 2.7), draw)
     numbers = [
