@@ -160,5 +160,5 @@ def test_a_plan_is_refused_or_flown_inside_its_fences(tmp_path: Path, drawn: Any
 @pytest.mark.parametrize(("strategy", "check"), [(worlds(), check_map), (plans(), check_plan)], ids=["maps", "plans"])
 def test_ten_thousand_are_refused_or_flown_inside_their_fences(tmp_path: Path, strategy: Any, check: Any) -> None:
     seen: Counter[str] = Counter()
-    MANY(given(strategy)(lambda drawn: check(tmp_path, drawn, seen)))()
+    MANY(given(strategy)(lambda drawn: check(tmp_path, drawn, seen)))()  # type: ignore[no-untyped-call]
     assert min(seen["refused"], seen["fenced"], seen["free"]) > 100, seen
