@@ -156,7 +156,8 @@ def check_report(out: Path, decisions: list[Decision], told: str) -> None:
     onboard = sum(d.source == "onboard" for d in decisions)
     assert summary.by_source.onboard == onboard and summary.by_source.policy == STEPS * UAVS - onboard
     real = summary.real_uavs
-    assert real is not None and real.uavs == sums_by_uav(decisions)
+    assert real is not None
+    assert real.uavs == sums_by_uav(decisions, {one.uav_id: (one.decided_m, one.flown_m) for one in real.uavs})
     # Each UAV counts what a sensor lost since that UAV first heard it, the whole since any UAV did, each packet once.
     # So the whole may exceed the UAVs' sum. It is no less than any UAV's own, and no more than the sensors lost.
     lost = summary.lost_packets["aic_vds"]
