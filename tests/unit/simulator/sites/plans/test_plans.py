@@ -201,7 +201,7 @@ def test_a_plain_text_mission_is_read(tmp_path: Path, text: str) -> None:
         (["QGC WPL 110", HOME, LINES[1].replace("16", "82"), LINES[2]], "line 3: command 82 is no straight leg"),
         (["QGC WPL 110", HOME], "0 waypoints; a path needs at least two"),
         (["QGC WPL 110"], "0 waypoints; a path needs at least two"),
-        (["<?xml version='1.0'?>", "<kml/>"], "it is XML, as KML and GPX are; open it in"),
+        (["<?xml version='1.0'?>", "<kml/>"], "it is XML, as KML and GPX are; save a map as GeoJSON"),
     ],
 )
 def test_a_broken_text_names_its_line(tmp_path: Path, lines: list[str], complaint: str) -> None:
