@@ -19,16 +19,16 @@ READING = ("GET", "HEAD")
 _UNCOUNTED = re.compile(r"/(healthz|readyz|metrics|static/.*|missions/[^/]+/events)?")
 # While a body arrives, its request counts against the limit of concurrent requests.
 _BODY_S = 10.0
-# A fleet's report has some thousand names of fields, columns' values none.
-_NAME, _MOST_NAMES = re.compile(rb'"\s*:'), 20_000
+# A batch has some thousand names of fields, a scenario at most 100,000 waypoints.
+_NAME, _MOST_NAMES, _MOST_LISTS = re.compile(rb'"\s*:'), 20_000, 120_000
 
 
 class _TooLarge(Exception):
     """The body exceeds the limit, before or after decompression."""
 
 
-class _TooManyNames(Exception):
-    """The body has more names than any request: to parse them all would take most of a second."""
+class _TooManyParts(Exception):
+    """The body has more parts than any request: to parse them all would take most of a second."""
 
 
 class _Damaged(Exception):
@@ -119,8 +119,10 @@ class RequestLimits:
             if encoding in _DECODERS:
                 body = _DECODERS[encoding](body, self._limit)
             if len(list(islice(_NAME.finditer(body), _MOST_NAMES + 1))) > _MOST_NAMES:
-                raise _TooManyNames
-        except (_TooLarge, TimeoutError, _Damaged, _TooManyNames) as fault:
+                raise _TooManyParts(f"has more than {_MOST_NAMES} names")
+            if body.count(b"[") + body.count(b"{") > _MOST_LISTS:
+                raise _TooManyParts(f"has more than {_MOST_LISTS} lists and objects")
+        except (_TooLarge, TimeoutError, _Damaged, _TooManyParts) as fault:
             await self._refusal(fault)(scope, receive, send)
             return None
         if encoding in _DECODERS or b"content-length" not in headers:
@@ -136,8 +138,8 @@ class RequestLimits:
                 problem = f"not received within {_BODY_S:g} s, or in less while {self._most} requests are in progress"
             case _Damaged():
                 status, problem = 400, str(fault)
-            case _TooManyNames():
-                status, problem = 422, f"has more than {_MOST_NAMES} names"
+            case _TooManyParts():
+                status, problem = 422, str(fault)
             case _:
                 status, problem = 413, f"larger than {self._limit} bytes"
         response = problem_response(status, f"body: {problem}", [{"field": "body", "problem": problem}])
