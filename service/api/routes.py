@@ -17,6 +17,7 @@ from service.api.api_keys import ApiKey, ApiKeys
 from service.api.authentication import KEY, no_mission
 from service.api.problem_details import documented
 from service.edge.engine import Engine
+from service.live.alarms import KINDS
 from service.llm.server_pool import ServerPool
 from service.mission.mission_status import status_of
 from service.observability.metrics import Metrics
@@ -250,5 +251,9 @@ async def metrics(request: Request) -> Response:
     llm: ServerPool = request.state.llm
     owned.keys_lost.set(_keys_lost(request))
     owned.record_llm(llm.statuses, llm.breakers_open)
+    engine: Engine = request.state.engine
+    found = engine.live.watch.alarms(engine.missions.loaded)
+    for kind in KINDS:
+        owned.alarms.labels(kind).set(found[kind])
     content, content_type = owned.exposed(request.headers.get("accept", ""))
     return Response(content, headers={"Content-Type": content_type})

@@ -137,7 +137,7 @@ class Broadcaster:
 
     def __init__(self) -> None:
         self.history = RecentDecisions()
-        self._watch = FleetWatch()
+        self.watch = FleetWatch()
         self._streams: dict[str, MissionStream] = {}
         self._listeners = 0
         self._sending: set[asyncio.Timeout] = set()
@@ -145,7 +145,7 @@ class Broadcaster:
 
     def decided(self, mission: Mission, uav: UavState, prompt: Prompt, answer: DecideResponse) -> None:
         """Show an answered decision with its prompt, even if no LLM received it."""
-        self._watch.decided(mission, uav, answer.step)
+        self.watch.decided(mission, uav, answer.step)
         self.history.decided((uav.position[0], uav.position[1]), prompt, answer)
         self.changed(answer.mission_id)
 
@@ -162,7 +162,7 @@ class Broadcaster:
     def forget(self, mission_id: str) -> None:
         """Forget a deleted mission, and notify its listeners."""
         self.history.forget(mission_id)
-        self._watch.forget(mission_id)
+        self.watch.forget(mission_id)
         if (stream := self._streams.pop(mission_id, None)) is not None:
             stream.deleted = True
             stream.close()
@@ -203,7 +203,7 @@ class Broadcaster:
         stream = self._streams.get(mission.mission_id)
         if stream is None:
             stream = self._streams[mission.mission_id] = MissionStream(
-                mission, self.history, self._watch.of(mission.mission_id)
+                mission, self.history, self.watch.of(mission.mission_id)
             )
         stream.listeners += 1
         try:

@@ -1,11 +1,14 @@
 """A fleet's problems in its reports: overflows by step, and silent sensors."""
 
 import time
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from service.live.alarms import alarms
 from service.mission.mission import Mission
 from shared.belief.fleet_belief import FleetBelief
 from shared.kit.bounded import BoundedDict
@@ -17,6 +20,8 @@ from shared.world.urgency import overflow_probability
 # Most missions watched, and most steps remembered of each.
 _MOST_MISSIONS = 1000
 _MOST_STEPS = 1000
+# Seconds without a decision after which a mission has ended early, and (with three steps) its UAVs are lost.
+_ENDED_S, _SILENT_S = 600.0, 30.0
 
 
 @dataclass(slots=True)
@@ -25,7 +30,7 @@ class Watched:
 
     Attributes:
         full: by step, the expected number of sensors that overflowed into it, as the fleet believed at its first
-            decision of the step.
+            decision of the step. Sensors of which nothing was ever heard do not count.
         silent: by sensor, the newest step in which a UAV was within its radio radius and did not hear it.
         decided_at: the monotonic time of the last decision, seconds; None before the first.
     """
@@ -64,6 +69,20 @@ class FleetWatch:
             found = self._missions[mission_id] = Watched()
         return found
 
+    def alarms(self, missions: Iterable[Mission]) -> Counter[str]:
+        """By kind of :mod:`service.live.alarms`, the number of UAVs and sensors of the missions that fly now."""
+        counts: Counter[str] = Counter()
+        for mission in missions:
+            watched, scenario = self._missions.get(mission.mission_id), mission.scenario
+            decided_at = None if watched is None else watched.decided_at
+            idle_s = _ENDED_S if decided_at is None else time.monotonic() - decided_at
+            if idle_s >= _ENDED_S or (mission.belief.newest or 0) >= scenario.steps - 1:
+                continue
+            counts.update({kind: len(found) for kind, found in alarms(mission, mission.deadlines()).items()})
+            if idle_s > max(_SILENT_S, 3 * scenario.step_s):
+                counts["uav_lost"] += len(mission.belief.uavs)
+        return counts
+
     def forget(self, mission_id: str) -> None:
         """Forget a deleted mission."""
         self._missions.take(mission_id)
@@ -83,9 +102,13 @@ class FleetWatch:
 
 
 def _overflowed(belief: FleetBelief, step: int, scenario: Scenario) -> FloatArray:
-    """The probability that each queue is full at a step's start, ``P(base + Poisson(rate x steps since) >= W)``."""
+    """The probability that each queue is full at a step's start, ``P(base + Poisson(rate x steps since) >= W)``.
+
+    It is 0 for sensors of which nothing was ever heard.
+    """
     # The arrivals of the steps since, in terms of the function's own horizon.
     arrived = belief.arrivals.rate * np.maximum(step - belief.since, 0) / scenario.overflow_horizon_steps
     # One more packet turns "more than full" into "at least full".
     reached = overflow_probability(belief.base + 1, arrived, scenario)
-    return np.where(belief.base >= scenario.queue_capacity, 1.0, reached)
+    full = np.where(belief.base >= scenario.queue_capacity, 1.0, reached)
+    return np.where(belief.base_variance > 0, 0.0, full)

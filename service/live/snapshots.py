@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json
 
+from service.live.alarms import alarms
 from service.live.fleet_watch import Watched
 from service.live.recent_decisions import RecentDecision
 from service.mission.mission import Mission
@@ -91,6 +92,7 @@ def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
         "learner_loss": mission.learner.last_loss,
         "guidance": _guidance(mission),
         "deadlines": {"met": sum(one.met for one in orders), "missed": sum(one.missed for one in orders)},
+        "alarms": alarms(mission, orders),
         **watched.totals(),
         "queue": np.round(queue, 1).tolist(),
         "urgency": np.round(urgency(queue, rate, scenario), 3).tolist(),

@@ -106,6 +106,9 @@ class Metrics:
         self._add_outcomes()
         self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
         self.tasks = Gauge("aicvds_tasks", "Tasks of the event loop", registry=r)
+        self.alarms = Gauge(
+            "aicvds_alarms", "UAVs and sensors of which a mission's page shows an alarm", ["kind"], registry=r
+        )
         self.missions = Gauge("aicvds_missions", "Missions in memory or in the store", registry=r)
         self.store_seconds = Histogram(
             "aicvds_store_seconds", "Time of a commit to the store", registry=r, buckets=_OVERHEAD_BUCKETS

@@ -17,10 +17,11 @@ export function showNumbers(mission) {
   const times = lately.map(latency).sort((a, b) => a - b);
   const typical = times.length ? times[Math.floor(times.length / 2)] : null;
   const roundTrip = lately.length > 0 && lately.every((d) => measured(d) !== null || d.outcome === null) && lately.some((d) => measured(d) !== null);
-  const full = now.queue.filter((packets) => packets >= scenario.queue_capacity - 0.5).length;
+  const full = now.queue.filter((packets, id) => now.heard[id] >= 0 && packets >= scenario.queue_capacity - 0.5).length;
+  const unknown = now.heard.filter((step) => step < 0).length;
   cell("Step", String(now.step), `of ${scenario.steps}, from 0; ${scenario.step_s} s each`);
   cell("Decisions", shown(now.made, 0), [...sources].sort((a, b) => b[1] - a[1]).map(([source, n]) => `${n} ${SOURCES[source] ?? source}`).join(", ") || "none yet");
-  cell("Overflows", `≈ ${shown(now.overflows, 0)}`, `believed; a sensor counts once a step. ${full} full now`);
+  cell("Overflows", `≈ ${shown(now.overflows, 0)}`, `believed; a sensor counts once a step. ${full} full now${unknown ? `; unknown of ${unknown} never heard` : ""}`);
   cell("Failed", String(totals.failed), totals.told ? `of ${totals.told} reported transmissions; cost ${shown(totals.cost, 1)}, with losses in reach only` : "no transmission reported yet");
   cell(roundTrip ? "Round trip" : "Edge's time", typical === null ? "–" : `${shown(typical)} ms`,
     typical === null ? "no decision yet" : `median of the newest ${times.length}; slowest ${shown(times.at(-1))} ms`, "time");
