@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,9 @@ Judged = Sequence[tuple[Point, Mapping[str, Held]]]
 _SHADES = ListedColormap(["#ffffff", "#c6dbef", "#9ecae1", "#6baed6", "#2171b5"])
 _MOOT = "#d9d9d9"
 _COUNTS = matplotlib.colormaps["Greens"]
-_FRAME = "#d62728"
-_PAPERS_POINT = (fill_row((0.3, 1.0)), 5.0)
+# The frames of the settings that are scenarios: the row, the arrivals, and the colour.
+_FRAMES = {"paper": (fill_row((0.3, 1.0)), 5.0, "#d62728"), "paper_light": ("step 20 s", 0.5, "#ff9500")}
+_NOT_FLOWN: dict[str, Any] = {"facecolor": "#ffffff", "edgecolor": "#cccccc", "hatch": "xxxx"}
 
 
 def write_verdicts(path: Path, judged: Judged, seeds: int) -> None:
@@ -84,17 +86,18 @@ def draw(folder: Path, judged: Judged, seeds: int) -> None:
 
 
 def _keys() -> list[Patch]:
-    look_ahead = "look-ahead in the LLM's place, from a random (r) or the shipped (s) start; v: mode value"
+    grey = "#888888"
     looks: dict[str, tuple[Any, str]] = {
-        "holds for all that it was judged for": (_SHADES(1.0), "#888888"),
-        look_ahead: ("none", "none"),
-        "holds for those whose letters are given": (_SHADES(0.5), "#888888"),
-        "moot: hardly a packet is lost": (_MOOT, "#888888"),
-        "fails": ("#ffffff", "#888888"),
-        "the setting of scenario paper": ("#ffffff", _FRAME),
+        "holds for all that it was judged for": (_SHADES(1.0), grey),
+        "holds for those whose letters are given": (_SHADES(0.5), grey),
+        "fails": ("#ffffff", grey),
+        "moot: hardly a packet is lost": (_MOOT, grey),
     }
-    labels = [list(looks)[i] for i in (0, 2, 4, 1, 3, 5)]
-    return [Patch(facecolor=looks[label][0], edgecolor=looks[label][1], label=label) for label in labels]
+    keys = [Patch(facecolor=face, edgecolor=edge, label=label) for label, (face, edge) in looks.items()]
+    stand_ins = "look-ahead in the LLM's place, from a random (r) or the shipped (s) start; v: mode value"
+    keys += [Patch(facecolor="none", edgecolor="none", label=stand_ins), Patch(**_NOT_FLOWN, label="not flown")]
+    frames = [(f"scenario {name}", colour) for name, (_, _, colour) in _FRAMES.items()]
+    return keys + [Patch(facecolor="#ffffff", edgecolor=colour, label=label) for label, colour in frames]
 
 
 def _grid(judged: Judged) -> tuple[list[str], list[float]]:
@@ -114,7 +117,7 @@ def _claim_panel(panel: Axes, claim: MapClaim, judged: Judged) -> None:
             letters = "".join(n[0] for n, holds in found.of.items() if holds)
             panel.text(column, row, letters, ha="center", va="center", fontsize=6)
     panel.imshow(np.ma.masked_invalid(shares), cmap=_SHADES, vmin=0, vmax=1, aspect="auto", zorder=0)
-    _finish(panel, claim.stated, rows, rates)
+    _finish(panel, claim.stated, judged)
 
 
 def _count_panel(panel: Axes, judged: Judged) -> None:
@@ -125,11 +128,16 @@ def _count_panel(panel: Axes, judged: Judged) -> None:
         letter, counts[row, column] = most_held(held)
         panel.text(column, row, f"{counts[row, column]:.0f}{letter}", ha="center", va="center", fontsize=6)
     panel.imshow(np.ma.masked_invalid(counts), cmap=_COUNTS, vmin=0, vmax=len(CLAIMS), aspect="auto", zorder=0)
-    _finish(panel, f"how many of the {len(CLAIMS)} hold,\nand for which stand-in", rows, rates)
+    _finish(panel, f"how many of the {len(CLAIMS)} hold,\nand for which stand-in", judged)
     panel.title.set_fontweight("bold")
 
 
-def _finish(panel: Axes, title: str, rows: Sequence[str], rates: Sequence[float]) -> None:
+def _finish(panel: Axes, title: str, judged: Judged) -> None:
+    rows, rates = _grid(judged)
+    flown = {(point.row, point.rate) for point, _ in judged}
+    for (at_y, row), (at_x, rate) in product(enumerate(rows), enumerate(rates)):
+        if (row, rate) not in flown:
+            panel.add_patch(Rectangle((at_x - 0.5, at_y - 0.5), 1, 1, **_NOT_FLOWN, lw=0, zorder=1))
     panel.set_title(title, fontsize=7)
     panel.set_xticks(range(len(rates)), [f"{rate:g}" for rate in rates], fontsize=6)
     panel.set_yticks(range(len(rows)), rows, fontsize=6)
@@ -141,6 +149,7 @@ def _finish(panel: Axes, title: str, rows: Sequence[str], rates: Sequence[float]
     variants = [row for row in rows if row in VARIANTS]
     if variants:
         panel.axhline(rows.index(variants[0]) - 0.5, color="#222222", lw=0.8)
-    if _PAPERS_POINT[0] in rows and _PAPERS_POINT[1] in rates:
-        at = rates.index(_PAPERS_POINT[1]) - 0.5, rows.index(_PAPERS_POINT[0]) - 0.5
-        panel.add_patch(Rectangle(at, 1, 1, fill=False, edgecolor=_FRAME, lw=1.2, zorder=3))
+    for row, rate, colour in _FRAMES.values():
+        if row in rows and rate in rates:
+            at = rates.index(rate) - 0.5, rows.index(row) - 0.5
+            panel.add_patch(Rectangle(at, 1, 1, fill=False, edgecolor=colour, lw=1.2, zorder=3))
