@@ -1,7 +1,7 @@
 """An edge's decisions without HTTP: a mission in this process, with the service's own state, attention and learner.
 
-A flight takes a tenth of a second of one core. Its losses equal those of the same mission over an edge; a test compares
-the two.
+A flight takes a tenth of a second of one core. Each outcome trains the modules after the decision that reports it, as
+at an edge.
 """
 
 from __future__ import annotations

@@ -17,17 +17,28 @@ from simulator.world.environment import PipelineWorld
 from simulator.world.observation_report import decide_request
 
 SHORT = SCENARIOS["paper"].model_copy(update={"steps": 12, "initial_queue_min": 0.9})
-SPECS: list[dict[str, Any]] = [{}, {"features": "paper", "belief": "reported", "init": "random"}]
+REPORTED: dict[str, Any] = {"features": "paper", "belief": "reported", "init": "random"}
 
 
-@pytest.mark.parametrize("spec", SPECS)
-def test_mode_value_loses_what_it_loses_over_an_edge(spec: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def lost_here(spec: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> list[int]:
     monkeypatch.setitem(flights.AT_THE_EDGE, "here", EdgeDecider("value", spec))
-    here = flights.fly("here", SHORT, range(2)).lost.sum(axis=1).tolist()
+    lost: list[int] = flights.fly("here", SHORT, range(2)).lost.sum(axis=1).tolist()
+    return lost
+
+
+def test_mode_value_loses_what_it_loses_over_an_edge(monkeypatch: pytest.MonkeyPatch) -> None:
+    here = lost_here({}, monkeypatch)
     with edge() as (url, _):
-        there = [served_only.flown(url, SHORT, seed, f"there-{seed}", {"mode": "value", **spec}) for seed in range(2)]
+        there = [served_only.flown(url, SHORT, seed, f"there-{seed}", {"mode": "value"}) for seed in range(2)]
     assert here == there
     assert sum(here) > 0
+
+
+def test_a_mission_of_reports_alone_does_not_need_the_belief(monkeypatch: pytest.MonkeyPatch) -> None:
+    unfed = lost_here(REPORTED, monkeypatch)
+    fed = lambda fleet, request: fleet.mission.observe(request, request.step)  # noqa: E731
+    monkeypatch.setattr(EdgeFleet, "_observe", fed)
+    assert lost_here(REPORTED, monkeypatch) == unfed
 
 
 def test_look_ahead_chooses_among_the_sensors_that_attention_keeps() -> None:
