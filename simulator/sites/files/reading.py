@@ -23,7 +23,5 @@ def quoted(value: object) -> str:
 def json_fault(text: str, error: object) -> str:
     """Why a text is no JSON: what it is instead, if that is known, or the parser's words."""
     if text.lstrip().startswith("<"):
-        return (
-            "it is XML, as KML and GPX are; save a map as GeoJSON in QGIS, a plan as .plan in QGroundControl"
-        )
+        return "it is XML, as KML and GPX are; save a map as GeoJSON in QGIS, a plan as .plan in QGroundControl"
     return str(error)
