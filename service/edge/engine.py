@@ -112,6 +112,7 @@ class Engine:
         mission, reports = await self.missions.resolve(request, may_make=may_make, key=key, deadline=deadline)
 
         async def make() -> list[RecordedDecision]:
+            self._feedback.catch_up(mission)
             # All outcomes are applied before the first decision, so that none is lost while the UAVs wait for the LLM.
             for outcome in (uav.outcome for uav in reports.uavs if uav.outcome is not None):
                 self._feedback.apply_reported(mission, outcome)
@@ -200,6 +201,7 @@ class Engine:
     async def _decide_one(
         self, mission: Mission, request: DecideRequest, watch: Stopwatch, deadline: Deadline
     ) -> list[RecordedDecision]:
+        self._feedback.catch_up(mission)
         if request.outcome is not None:
             self._feedback.apply_reported(mission, request.outcome)
         attempt = mission.observe(request, request.step)

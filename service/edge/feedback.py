@@ -93,6 +93,10 @@ class Feedback:
         self._training.catch_up(mission)
         self._journal.checkpoint(mission_log, {**mission.state_dict(), "learner": mission.learner.state_dict()})
 
+    def catch_up(self, mission: Mission) -> None:
+        """Finish the mission's waiting training: a request that comes at once decides as one that comes later."""
+        self._training.catch_up(mission)
+
     def finish(self) -> None:
         """Finish all waiting training now."""
         self._training.finish()

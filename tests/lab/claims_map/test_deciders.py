@@ -26,10 +26,11 @@ def lost_here(spec: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> list[int
     return lost
 
 
-def test_mode_value_loses_what_it_loses_over_an_edge(monkeypatch: pytest.MonkeyPatch) -> None:
-    here = lost_here({}, monkeypatch)
+@pytest.mark.parametrize("spec", [{}, REPORTED])
+def test_mode_value_loses_what_it_loses_over_an_edge(spec: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    here = lost_here(spec, monkeypatch)
     with edge() as (url, _):
-        there = [served_only.flown(url, SHORT, seed, f"there-{seed}", {"mode": "value"}) for seed in range(2)]
+        there = [served_only.flown(url, SHORT, seed, f"there-{seed}", {"mode": "value", **spec}) for seed in range(2)]
     assert here == there
     assert sum(here) > 0
 

@@ -13,7 +13,7 @@ import pytest
 
 from service.config.settings import Settings
 from service.edge.engine import Engine
-from service.edge.feedback import Feedback
+from service.edge.feedback import Feedback, LearningQueue
 from service.live.broadcaster import Broadcaster
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
@@ -60,6 +60,21 @@ def test_an_outcome_is_learned_after_the_decision_that_it_came_with(tmp_path: Pa
         untaught, _ = told_by(client, engine, None)
     assert taught == untaught
     assert later != taught
+
+
+def test_a_request_that_comes_at_once_decides_with_every_earlier_outcome_learned(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The event loop may read the next request before it trains: here it never trains by itself."""
+    monkeypatch.setattr(LearningQueue, "_train_some", lambda queue: None)
+    with running(tmp_path / "busy.db") as (client, engine):
+        first = client.post("/decide", json=report(step=1)).json()
+        outcome = {"outcome": {"decision_id": first["decision_id"], "cost": 7.0}}
+        client.post("/decide", json=report(step=2) | outcome)
+        mission = engine.missions.loaded[0]
+        assert mission.learner.updates == 0
+        client.post("/decide", json=report(step=3))
+        assert mission.learner.updates == 1
 
 
 @pytest.mark.long
