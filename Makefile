@@ -25,7 +25,7 @@ help:
 	@echo "make docs      install, build the documentation into site/, to be read without a network"
 	@echo "make bench     measure the edge and its LLM, side by side with others: runs/*.json; 25 minutes"
 	@echo "make faults    fail, kill and starve real processes, and write docs/results/faults.md: 10 minutes"
-	@echo "make fuzz      send 10,000 requests that schemathesis generates, with keys and without: none may break the edge"
+	@echo "make fuzz      10,000 generated requests, maps and plans: none breaks the edge, or flies outside its fences"
 	@echo "make soak      fly 200 missions for MINUTES=10: memory, tasks and connections must not grow"
 	@echo "make compose   build the containers and fly a mission in them (needs a Docker engine)"
 	@echo "make release   build and try wheel, sdist and SBOM in dist/, and the images; IMAGES=required: fail without images"
@@ -92,7 +92,7 @@ faults: install
 	$(BIN)/pytest -m faults --capture=tee-sys tests/faults
 
 fuzz: install
-	$(BIN)/pytest -m fuzz --capture=tee-sys tests/faults
+	$(BIN)/pytest -m fuzz --capture=tee-sys tests/faults tests/unit
 
 soak: install
 	$(BENCH).soak --minutes $(MINUTES)

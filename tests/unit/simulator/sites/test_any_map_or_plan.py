@@ -157,7 +157,7 @@ def test_a_plan_is_refused_or_flown_inside_its_fences(tmp_path: Path, drawn: Any
     check_plan(tmp_path, drawn, Counter())
 
 
-@pytest.mark.long
+@pytest.mark.fuzz
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize(("strategy", "check"), [(worlds(), check_map), (plans(), check_plan)], ids=["maps", "plans"])
 def test_ten_thousand_are_refused_or_flown_inside_their_fences(tmp_path: Path, strategy: Any, check: Any) -> None:
