@@ -17,6 +17,7 @@ import httpx
 import pytest
 import tyro
 
+from lab.commands.experiment import FIGURES, MAP
 from lab.experiments.catalogue import EXPERIMENTS
 from shared.client.edge_client import EdgeClient
 from shared.kit import command_line as cli
@@ -52,6 +53,9 @@ SERVED = [
     f"AICVDS_LLM_URL=http://localhost:11434/v1 AICVDS_LLM_MODEL=qwen3:8b {BIN}aicvds serve",
     "AICVDS_LLM_URL=http://localhost:8081/v1,http://localhost:8082/v1 AICVDS_LLM_ORDER=mission AICVDS_LLM_SLOTS=4 "
     f"{BIN}aicvds serve",
+    "AICVDS_LLM_URL=https://api.openai.com/v1 AICVDS_LLM_MODEL=gpt-4o-mini AICVDS_LLM_API_KEY=sk-… \\\n"
+    "AICVDS_LLM_ADAPTER=off AICVDS_VERIFY=off AICVDS_MODE=llm AICVDS_DEADLINE_MS=10000 \\\n"
+    f"AICVDS_PRICE_INPUT=0.15 AICVDS_PRICE_CACHED=0.075 AICVDS_PRICE_OUTPUT=0.6 {BIN}aicvds serve",
 ]
 KEYED = [
     f"KEY=$({BIN}aicvds keys add fleet-1 --file keys.json --scopes decide admin)",
@@ -65,6 +69,7 @@ PARSED = {
     "aicvds mqtt": "it goes on until it is ended; tests/e2e/test_mqtt.py runs it with a broker",
     "aicvds fly": "it waits for vehicles; tests/unit/field/vehicles and tests/e2e/test_fly.py fly it",
     "python -m lab experiment": "minutes to hours; tests/e2e/test_experiment.py runs them small",
+    "python -m lab train": "minutes to hours; tests/lab/marl runs it small",
     "python -m lab explore": "minutes; tests/e2e/test_pretrain.py runs it small",
     "python -m lab distill": "an hour; tests/lab/distilling/test_distill.py runs it small",
     "python -m lab distill-orders": "an hour; tests/lab/distilling/test_distill_orders.py runs it small",
@@ -219,7 +224,7 @@ def test_an_edge_with_keys_is_flown_as_shown(workspace: Path) -> None:
 def test_what_takes_long_is_at_least_understood(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     program, *args = shlex.split(command.removeprefix(BIN))
     if args[:3] == ["-m", "lab", "experiment"]:
-        assert args[3] in (*EXPERIMENTS, "all", "page")
+        assert args[3] in (*EXPERIMENTS, "all", "page", MAP, FIGURES)
     with monkeypatch.context() as patched:
         patched.setattr(tyro, "cli", only_parsed(tyro.cli))
         if program == "aicvds":

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from lab.marl import madqn
+from lab.marl import madqn, paper_madqn
 from lab.marl.checkpoint import PolicyCheckpoint
 from lab.marl.evaluate import lost_packets
 from lab.marl.learned import Learned
@@ -48,7 +48,7 @@ def test_the_plain_state_is_what_the_uav_heard() -> None:
 
 def test_every_agent_learns_and_the_target_follows_by_tau(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
-    monkeypatch.setattr("lab.marl.paper_madqn.WARM_UP", 0)
+    monkeypatch.setattr(paper_madqn, "WARM_UP", 0)
     scheme = PaperMadqn(SMALL, 20, 0)
     scheme.round()
     while scheme._iterations % madqn.UPDATE_TARGET_EVERY != madqn.UPDATE_TARGET_EVERY - 1:

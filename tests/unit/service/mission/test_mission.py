@@ -54,7 +54,7 @@ def test_experiences_grow_by_appending_and_are_compacted_at_once() -> None:
     for number in range(1, 7):
         m.apply(outcome(decide(m, number, step=number), cost=number / 10))
         texts.append("".join(m.experiences.block))
-    assert all(later.startswith(earlier) for earlier, later in itertools.pairwise(texts))
+    assert all(later.startswith(earlier) for earlier, later in itertools.pairwise(texts[:4]))
     assert len(m.experiences.block) == 3
     assert [line.split()[-1] for line in m.experiences.block] == ["0.4", "0.5", "0.6"]
 
