@@ -89,7 +89,7 @@ bench: install
 	-$(BENCH).page --seconds 10
 
 faults: install
-	$(BIN)/pytest -m faults --capture=tee-sys tests/faults
+	$(BIN)/pytest -m faults --capture=tee-sys tests/faults tests/e2e/test_fly.py
 
 fuzz: install
 	$(BIN)/pytest -m fuzz --capture=tee-sys tests/faults tests/unit

@@ -107,7 +107,7 @@ def test_every_waypoint_is_decided_though_the_edge_is_gone_for_twenty_seconds(tm
     check_report(tmp_path / "out", decisions, told)
 
 
-@pytest.mark.long
+@pytest.mark.faults
 @pytest.mark.timeout(900)
 def test_airframes_with_limits_fly_what_is_decided_and_lose_no_more_than_the_simulators(tmp_path: Path) -> None:
     decisions, peers, told = flown_with_an_outage(tmp_path, 1.0, ARDUPILOT, top=11.0, accelerates=2.5)
