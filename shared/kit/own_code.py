@@ -33,16 +33,22 @@ def imported(name: str) -> Any:
 
 
 def _from_file(path: Path) -> ModuleType:
-    """The module of a file, whose folder its own imports find first."""
-    spec = spec_from_file_location(path.stem, path)
+    """The module of a file, run once a process, whose folder its own imports find first."""
+    # A name that shadows no module: a user's file may be called random.py.
+    name = f"own_code:{path.resolve()}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = spec_from_file_location(name, path)
     if not path.is_file() or spec is None or spec.loader is None:
         raise ValueError(f"there is no file {path}")
-    # Dataclasses and pickled policies look their module up by its name.
-    module = sys.modules[path.stem] = module_from_spec(spec)
+    module = module_from_spec(spec)
     sys.path.insert(0, str(path.parent.resolve()))
+    # Dataclasses look their module up by its name while it runs.
+    sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
     except (ImportError, SyntaxError) as error:
+        del sys.modules[name]
         raise ValueError(f"{path}: {error}") from None
     finally:
         sys.path.remove(str(path.parent.resolve()))

@@ -156,7 +156,7 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
             wait_out=("loading", "unavailable") if options.await_llm == "on" else ("loading",),
             reconnect_s=options.reconnect_s,
             bound_s=BOUND_S if options.bound else 0.0,
-            against=(*BASELINES, *options.against),
+            against=tuple(dict.fromkeys((*BASELINES, *options.against))),
             pace=_pace(options.pace),
         )
         metrics = FlightMetrics(site.scenario.steps)
@@ -187,9 +187,11 @@ def check(options: Simulate) -> None:
     check_between("--metrics-port", options.metrics_port, 0, 65_535)
     check_mission(options.mission)
     check_note(options.note)
-    if options.policy == "edge":
+    if options.policy == "edge" or options.edge is not None:
         edge_from_option(options.edge)
-    elif (mode := _mode_of(options.policy)) is not None:
+    if options.policy == "edge":
+        return
+    if (mode := _mode_of(options.policy)) is not None:
         if options.mode not in (None, mode):
             raise UsageError(f"--policy {options.policy} and --mode {options.mode} contradict each other")
     else:

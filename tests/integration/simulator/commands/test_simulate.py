@@ -100,8 +100,8 @@ class Fullest:
 @pytest.mark.usefixtures("undrawn")
 def test_an_own_policy_flies_beside_modes_of_an_edge_started_for_it(tmp_path: Path) -> None:
     (tmp_path / "own_part.py").write_text("VELOCITY = 3", "utf-8")
-    (tmp_path / "fullest_of_mine.py").write_text(OWN_POLICY, "utf-8")
-    policy, out = f"{tmp_path}/fullest_of_mine.py:Fullest", tmp_path / "run"
+    (tmp_path / "random.py").write_text(OWN_POLICY, "utf-8")
+    policy, out = f"{tmp_path}/random.py:Fullest", tmp_path / "run"
     arguments = ["--against", "edge:value", "--against", "round_robin", "--sensors", "6", "--uavs", "2"]
     assert simulate.main(["--policy", policy, *arguments, "--no-bound", "--steps", "2", "--out", str(out)]) == 0
     summary = summary_in(out)
@@ -202,6 +202,8 @@ def test_a_mission_that_does_not_fit_is_refused(
         (["--policy", "eof", "--uplink", "delta"], "--uplink delta means nothing"),
         (["--policy", "edge:magic"], "--policy edge:magic: choose one of edge:llm, edge:guided, edge:value"),
         (["--policy", "edge:llm", "--mode", "value"], "--policy edge:llm and --mode value contradict"),
+        (["--policy", "edge:value", "--edge", "nowhere"], "'nowhere' is not an edge's URL"),
+        (["--policy", "eof", "--against", "edge:value", "--edge", "nowhere"], "'nowhere' is not an edge's URL"),
         (["--policy", "eof", "--against", "edge"], "--against edge: say in which mode"),
         (["--policy", "eof", "--against", "magic"], "--against magic: choose one of"),
         (["--policy", "eof", "--against", "none.py:Mine"], "policy none.py:Mine: there is no file none.py"),
