@@ -55,7 +55,7 @@ class PathFollower:
             count = min(_MOST_SAMPLES, int((last - first) / _SAMPLE_M) + 2)
             at, gap = self._nearest(position, first, last, count)
             if gap <= SLACK_M:
-                # To the centimetre: a speed is worked out from what is left of a way.
+                # Exact to a centimetre, because the next speed follows from the metres that are left.
                 apart_m = (last - first) / (count - 1)
                 self.progress_m, gap = self._nearest(position, max(0.0, at - apart_m), at + apart_m, int(200 * apart_m))
                 return gap

@@ -8,8 +8,6 @@ from typing import TypedDict
 
 import torch
 from fastapi import FastAPI
-from fastapi.routing import APIRoute
-from starlette.middleware.gzip import GZipMiddleware
 
 from service.api import live_routes, problem_details
 from service.api.api_keys import ApiKeys
@@ -86,10 +84,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     )
     # include_router would build each route once more, on the first request.
     app.router.routes += [*decisions.routes, *router.routes, *live_routes.router.routes]
-    app.mount("/static", GZipMiddleware(live_routes.ASSETS, minimum_size=1000), name="static")
-    for route in live_routes.router.routes:
-        if isinstance(route, APIRoute) and route.path in ("/", "/missions"):
-            route.app = GZipMiddleware(route.app, minimum_size=1000)
+    app.mount("/static", live_routes.compressed(live_routes.ASSETS), name="static")
     app.add_middleware(RequestLimits, most=settings.max_requests, limit=settings.max_body_bytes)
     if keys is not None:
         app.add_middleware(KeyAuthentication, keys=keys)

@@ -9,9 +9,11 @@ from pathlib import Path
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import FileResponse, StreamingResponse
+from fastapi.routing import APIRoute
 from fastapi.staticfiles import StaticFiles
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.responses import Response
-from starlette.types import Message, Scope, Send
+from starlette.types import ASGIApp, Message, Scope, Send
 
 from service import live
 from service.api.authentication import STILL_KNOWN
@@ -165,3 +167,13 @@ async def get_prompt(mission_id: MissionId, decision_id: DecisionId, engine: The
         experiences=prompt.experiences,
         state=prompt.state,
     )
+
+
+def compressed(app: ASGIApp) -> ASGIApp:
+    """The application, whose answers of 1 kB and more are compressed for clients that accept gzip."""
+    return GZipMiddleware(app, minimum_size=1000)
+
+
+for _route in router.routes:
+    if isinstance(_route, APIRoute) and _route.path in ("/", "/missions"):
+        _route.app = compressed(_route.app)

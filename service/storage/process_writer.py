@@ -66,7 +66,8 @@ class ProcessWriter:
     def write(self, changes: Sequence[Change], done: Done) -> None:
         """As :class:`Writer` says."""
         if self._final is not None:
-            raise self._final
+            # Raised again and again, one exception would collect the frames of each time.
+            raise self._final.with_traceback(None)
         transaction = msgpack.packb(self._statements.of(changes), buf_size=PACK_BYTES)
         self._frame = LENGTH.pack(len(transaction)) + transaction
         self._repeated = False

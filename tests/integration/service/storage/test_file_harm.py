@@ -231,7 +231,7 @@ async def test_other_bytes_of_the_same_event_are_an_error(
     writer = store.writer()
     right: list[Change] = [made("test", epoch), Entry("test", 1, GuidanceChanged({"note": "a"}), epoch)]
     await written(writer, right)
-    # What was committed already may come again.
+    # A repeated event with the same bytes does no harm.
     await written(writer, right)
     for other in (made("test", epoch, seed=7), Entry("test", 1, GuidanceChanged({"note": "b"}), epoch)):
         with pytest.raises(Exception) as failed:
