@@ -1,4 +1,4 @@
-"""A long flight of 200 missions against one edge: do its memory, tasks, connections and files stay bounded?
+"""A long flight of 200 missions against one edge, with hostile clients: does what it uses stay bounded?
 
     python -m benchmarks.soak --minutes 60
 
@@ -8,9 +8,11 @@ and full after some 300 outcomes. The resident memory is a peak, and rises ever 
 first flies at full speed, for 900 outcomes of every mission (300 of those that ask the LLM). Then it flies at the pace
 of the paper's world, a step of every mission in 10 s, and the measurement begins after 4 minutes of that pace;
 ``--pace-s 0`` measures at full speed. The results are the slope of the resident memory, by least squares over medians
-of 20 parts (an LLM's call takes 8 MB and returns them), with its 95% interval, the first and last count of
-tasks, connections and open files, and the sources of mode ``guided``'s decisions. It prints them, and writes the same
-as JSON. ``--guided 0`` shows the edge without the LLM's own memory.
+of 20 parts (an LLM's call takes 8 MB and returns them), with its 95% interval, the count of tasks, connections and open
+files before and after the hostile clients, lost outcomes, late and unstored decisions, and the sources of mode
+``guided``'s decisions. It prints them, and writes the same as JSON. The hostile clients are there while it settles and
+measures: they do not read, read or write a byte a second, or vanish. ``--guided 0`` shows the edge without the LLM's
+own memory.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -31,6 +34,7 @@ from rich.progress import Progress
 from scipy import stats
 
 from benchmarks.harness import Goal, Options, Report, Server, edge, run
+from benchmarks.hostile_clients import hostile
 from benchmarks.missions import Flown, Radio
 
 SAMPLE_S = 2.0
@@ -52,6 +56,10 @@ class Soak(Options):
     """All missions."""
     warm: tuple[int, int] = (900, 300)
     """Outcomes of each mission before the measurement, in mode value and in mode guided."""
+    hostile: int = 100
+    """Hostile clients of each of the five kinds at a time; 0: none."""
+    counted_s: float = 30.0
+    """Seconds before and after the hostile clients in which tasks, connections and files are counted."""
     settle_s: float = 240.0
     """Seconds at the pace before the measurement, in which memory freed by the slower pace is used again."""
 
@@ -62,6 +70,9 @@ class Mission(Flown):
 
     mode: str = "value"
     sources: Counter[str] = field(default_factory=Counter)
+    reported: int = 0
+    """Acknowledged outcomes since the mission was made."""
+    unstored: int = 0
 
 
 @dataclass
@@ -103,18 +114,26 @@ class Worker(threading.Thread):
             self._radio.post(f"/missions/{mission.name}", {}, "DELETE")
             self._radio.made(mission.name, mission.mode)
             mission.owed.clear()
+            mission.reported = 0
+        reported = len(mission.owed)
         decisions = self._radio.step(mission, attempts=1 + (self._random.randrange(20) == 0))
+        mission.reported += reported
+        mission.unstored += sum(not decision["stored"] for decision in decisions)
         mission.sources.update(decision["source"] for decision in decisions)
+
+
+def metric(edge: Server, name: str) -> float:
+    """The present value of a metric without labels."""
+    lines = httpx.get(f"{edge.url}/metrics", timeout=30).text.splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith(f"{name} "))
 
 
 def sample(edge: Server, began: float) -> Sample:
     """The edge's present resources."""
-    lines = httpx.get(f"{edge.url}/metrics", timeout=30).text.splitlines()
-    tasks = next(float(line.split()[1]) for line in lines if line.startswith("aicvds_tasks "))
     return Sample(
         at_s=time.monotonic() - began,
         resident_mb=edge.resident_bytes() / 1e6,
-        tasks=tasks,
+        tasks=metric(edge, "aicvds_tasks"),
         connections=len(edge.process.net_connections("tcp")),
         files=edge.process.num_fds(),
     )
@@ -135,7 +154,10 @@ def measure(options: Soak) -> Report:
     """Fly; the report's goals say whether anything grows."""
     missions = [Mission(f"soak{n}", mode="guided" if n < options.guided else "value") for n in range(options.missions)]
     with edge({"LOG_LEVEL": "error", **({} if options.guided else {"MODE": "value"})}) as server:
-        samples = _fly(server, missions, options)
+        samples, counts, ended = _fly(server, missions, options)
+        statuses = [httpx.get(f"{server.url}/missions/{mission.name}", timeout=30).json() for mission in missions]
+        late = metric(server, "aicvds_deadline_missed_total")
+    lost = sum(mission.reported - status["feedback"] for mission, status in zip(missions, statuses, strict=True))
     grown, half = slope(samples)
     figures: dict[str, Any] = {
         "minutes": options.minutes,
@@ -143,20 +165,26 @@ def measure(options: Soak) -> Report:
         "pace_s": options.pace_s,
         "decisions": sum(mission.sources.total() for mission in missions),
         "guided": dict(sum((mission.sources for mission in missions if mission.mode == "guided"), Counter[str]())),
+        "hostile_connections_ended": dict(ended),
+        "late": late,
+        "lost": lost,
+        "unstored": sum(mission.unstored for mission in missions),
         "resident_mb": [round(samples[0].resident_mb, 1), round(samples[-1].resident_mb, 1)],
         "slope_mb_an_hour": [round(value, 2) for value in (grown, grown - half, grown + half)],
     }
     goals = [Goal("memory, MB an hour, lower bound", grown - half, most=1.0)]
-    tenth = max(1, len(samples) // 10)
+    goals += [Goal(name, figures[name], most=0) for name in ("late", "lost", "unstored")]
     for name in ("tasks", "connections", "files"):
-        counts = [getattr(s, name) for s in samples]
-        first, last = figures[name] = [max(counts[:tenth]), max(counts[-tenth:])]
+        first, last = figures[name] = [max(getattr(s, name) for s in part) for part in counts]
         goals.append(Goal(f"growth of the {name}", last - first, most=5))
     rows = {name: {"measured": str(figure)} for name, figure in figures.items()}
     return Report(figures, {"Soak": rows}, goals)
 
 
-def _fly(edge: Server, missions: list[Mission], options: Soak) -> list[Sample]:
+def _fly(
+    edge: Server, missions: list[Mission], options: Soak
+) -> tuple[list[Sample], tuple[list[Sample], list[Sample]], Counter[str]]:
+    """The samples of the measurement, those before and after the hostile clients, and their ended connections."""
     for mission in missions:
         Radio(edge, 0).made(mission.name, mission.mode)
     guided, others = missions[: options.guided], missions[options.guided :]
@@ -168,23 +196,30 @@ def _fly(edge: Server, missions: list[Mission], options: Soak) -> list[Sample]:
     _watch(workers, "warming up", 1.0, lambda: min(mission.told / warm[mission.mode] for mission in missions))
     for worker in workers:
         worker.pace_s = options.pace_s
-    settles = time.monotonic()
-    if options.pace_s:
-        _watch(workers, "at the pace", 1.0, lambda: (time.monotonic() - settles) / options.settle_s)
-    for mission in missions:
-        mission.sources.clear()
-    began, samples = time.monotonic(), list[Sample]()
 
-    def sampled() -> float:
-        samples.append(sample(edge, began))
-        return samples[-1].at_s / (60 * options.minutes)
+    def sampled(label: str, seconds: float) -> list[Sample]:
+        began, samples = time.monotonic(), list[Sample]()
 
-    _watch(workers, "measuring", SAMPLE_S, sampled)
+        def share() -> float:
+            samples.append(sample(edge, began))
+            return samples[-1].at_s / seconds
+
+        _watch(workers, label, SAMPLE_S, share)
+        return samples
+
+    before = sampled("counting", options.counted_s)
+    with hostile(edge.url, options.hostile) if options.hostile else nullcontext(Counter[str]()) as ended:
+        if options.pace_s:
+            sampled("at the pace", options.settle_s)
+        for mission in missions:
+            mission.sources.clear()
+        samples = sampled("measuring", 60 * options.minutes)
+    after = sampled("counting again", options.counted_s)
     for worker in workers:
         worker.over = True
     for worker in workers:
         worker.join(timeout=60)
-    return samples
+    return samples, (before, after), ended
 
 
 def _watch(workers: list[Worker], label: str, pause_s: float, share: Callable[[], float]) -> None:
