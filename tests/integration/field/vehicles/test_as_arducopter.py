@@ -185,7 +185,7 @@ async def test_the_top_speed_of_an_airframe_is_seen_though_every_speed_is_acknow
                 await uav.update(1.0)
             assert uav.top_speed_m_s is None, "it flies what is commanded"
             await uav.command(14)
-            assert peer.airframe.speed == 14.0
+            assert peer.airframe.speed > 13.0, "the autopilot acknowledges what the airframe cannot fly"
             async with asyncio.timeout(PATIENCE_S):
                 while uav.top_speed_m_s is None:
                     await asyncio.sleep(0.25)
