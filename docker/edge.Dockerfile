@@ -81,4 +81,4 @@ EXPOSE 8000
 HEALTHCHECK --interval=5s --timeout=3s --start-period=120s --retries=3 CMD ["python", "-c", \
   "import json, sys, urllib.request as u; sys.exit(json.load(u.build_opener(u.ProxyHandler({})).open('http://127.0.0.1:8000/readyz', timeout=2))['llm'] == 'loading')"]
 ENTRYPOINT ["tini", "--"]
-CMD ["aicvds", "serve", "--host", "0.0.0.0"]
+CMD ["aicvds", "serve", "--host", "0.0.0.0", "--port", "8000"]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from pydantic import ValidationError
@@ -56,10 +56,10 @@ class Doctor:
     Exit code: 0 nothing is in the way, 1 something is.
     """
 
-    host: str = "127.0.0.1"
-    """Address that the edge is to listen on."""
-    port: Annotated[int, tyro.conf.arg(metavar="1-65535")] = 8000
-    """Port that the edge is to listen on."""
+    host: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS", help_behavior_hint="")] = None
+    """Address that the edge is to listen on. Default: AICVDS_HOST, or 127.0.0.1."""
+    port: Annotated[int | None, tyro.conf.arg(metavar="1-65535", help_behavior_hint="")] = None
+    """Port that the edge is to listen on. Default: AICVDS_PORT, or 8000."""
     llm_url: Annotated[str | None, tyro.conf.arg(metavar="URL")] = None
     """Address of an LLM server, as AICVDS_LLM_URL, to be judged before a flight."""
 
@@ -80,34 +80,35 @@ class Finding:
 def main(argv: list[str]) -> int:
     """Run ``aicvds doctor``; returns the exit code."""
     options = tyro.cli(Doctor, prog="aicvds doctor", args=argv)
-    if not 1 <= options.port <= 65535:
+    if options.port is not None and not 1 <= options.port <= 65535:
         print(f"aicvds doctor: --port {options.port} is not between 1 and 65535", file=sys.stderr)
         return 2
+    given = {name: value for name, value in vars(options).items() if value is not None}
     trouble = 0
-    for finding in findings(options.host, options.port, options.llm_url):
+    for finding in findings(given):
         print(finding, flush=True)
         trouble += finding.remedy is not None
     print(f"{trouble} in the way" if trouble else "Nothing is in the way. Next:  aicvds serve")
     return 1 if trouble else 0
 
 
-def findings(host: str, port: int, llm_url: str | None = None) -> Iterator[Finding]:
-    """All findings, in the order in which a start would meet them."""
+def findings(given: dict[str, Any]) -> Iterator[Finding]:
+    """All findings, in the order in which a start would meet them; ``given`` settings replace the environment's."""
     yield versions()
-    yield port_of(host, port)
     for name, meant in unknown_variables().items():
         yield Finding("settings", f"{name} is no setting and changes nothing{meant}", f"unset {name}")
     try:
-        settings = Settings() if llm_url is None else Settings(llm_url=llm_url)
+        settings = Settings(**given)
     except ValidationError as error:
         for fault in error.errors():
             name = "AICVDS_" + "_".join(str(part) for part in fault["loc"]).upper()
             found = f"{name.removesuffix('_')}: {problem_of(fault)}"
             yield Finding("settings", found, "see docs/reference/settings.md")
         return
+    yield port_of(settings.host, settings.port)
     yield Finding("settings", f"mode {settings.mode}, deadline {settings.deadline_ms} ms, top-k {settings.top_k}")
     yield store_of(settings)
-    if settings.mode in LLM_MODES or llm_url:
+    if settings.mode in LLM_MODES or "llm_url" in given:
         yield from (llm_servers(settings) if settings.llm_url else embedded(settings))
     yield planner(settings)
 

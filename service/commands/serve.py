@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import ipaddress
+import logging
 import os
 import signal
 import socket
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
     from service.config.settings import Settings
 
+log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class ServeOptions:
@@ -36,10 +39,11 @@ class ServeOptions:
     Try it:  curl localhost:8000/readyz
     """
 
-    host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 for every interface. Any but loopback needs AICVDS_KEYS, or AICVDS_ANONYMOUS=on."""
-    port: Annotated[int, tyro.conf.arg(metavar="0-65535")] = 8000
-    """Port to listen on; 0 picks a free one."""
+    host: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS", help_behavior_hint="")] = None
+    """Address to listen on; 0.0.0.0 for every interface. Any but loopback needs AICVDS_KEYS, or AICVDS_ANONYMOUS=on.
+    Default: AICVDS_HOST, or 127.0.0.1."""
+    port: Annotated[int | None, tyro.conf.arg(metavar="0-65535", help_behavior_hint="")] = None
+    """Port to listen on; 0 picks a free one. Default: AICVDS_PORT, or 8000."""
     mode: Annotated[Mode | None, tyro.conf.arg(metavar="guided|llm|value|policy", help_behavior_hint="")] = None
     """Who decides where a mission does not say. Default: AICVDS_MODE, or guided."""
     llm_url: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
@@ -57,7 +61,7 @@ class ServeOptions:
 
     def settings(self) -> dict[str, Any]:
         """The settings that were given as options; the environment has the others."""
-        names = ("mode", "llm_url", "llm_model", "store")
+        names = ("host", "port", "mode", "llm_url", "llm_model", "store")
         given = {name: getattr(self, name) for name in names}
         return {name: value for name, value in given.items() if value is not None}
 
@@ -68,10 +72,13 @@ def main(argv: list[str]) -> int:
     # library reads this variable once, when torch loads it.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     args = tyro.cli(ServeOptions, prog="aicvds serve", args=argv)
-    if not 0 <= args.port <= 65535:
-        return _refused(f"--port {args.port} is not between 0 and 65535")
+    if _logs_json():
+        from service.observability import logs
+
+        # The settings' own faults are lines of JSON too.
+        logs.configure("info", "json")
     # The edges on a cluster listen on their machines' addresses.
-    settings = checked_settings(args.settings(), args.host if args.ray in (None, "local") else f"Ray at {args.ray}")
+    settings = checked_settings(args.settings(), None if args.ray in (None, "local") else f"Ray at {args.ray}")
     if settings is None:
         return 2
     replicas = _bounds(args.replicas)
@@ -80,18 +87,18 @@ def main(argv: list[str]) -> int:
     if args.ray is not None and not settings.store.startswith("postgresql"):
         return _refused("--ray: edges on several machines share a store only in PostgreSQL: set AICVDS_STORE")
     try:
-        family = socket.AF_INET6 if ":" in args.host else socket.AF_INET
-        listener = socket.create_server((args.host, args.port), family=family)
+        family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+        listener = socket.create_server((settings.host, settings.port), family=family)
     except OSError as error:
-        other = "; choose another --port, or 0 for a free one" if args.port else ""
-        return _refused(f"cannot listen on {args.host}:{args.port}: {error.strerror or error}{other}")
-    host = f"[{args.host}]" if ":" in args.host else args.host
+        other = "; choose another --port, or 0 for a free one" if settings.port else ""
+        return _refused(f"cannot listen on {settings.host}:{settings.port}: {error.strerror or error}{other}")
+    host = f"[{settings.host}]" if ":" in settings.host else settings.host
     url = f"http://{host}:{listener.getsockname()[1]}"
     # uvicorn raises the signal again once it has ended.
     on_sigterm = signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     try:
         # The system queues requests from here on. /healthz answers immediately, the other routes once torch is loaded.
-        print(f"aicvds serve: listening on {url}, loading", file=sys.stderr, flush=True)
+        _say(f"aicvds serve: listening on {url}, loading")
         # Nearly every object made while loading stays, and collecting garbage would take a tenth of the time.
         gc.disable()
         with listener:
@@ -105,13 +112,13 @@ def main(argv: list[str]) -> int:
         gc.enable()
 
 
-def checked_settings(given: dict[str, Any], host: str) -> Settings | None:
-    """The settings, where an edge can listen on ``host`` with them; None once the faults are printed."""
+def checked_settings(given: dict[str, Any], host: str | None = None) -> Settings | None:
+    """The settings, where an edge can listen on ``host`` (by default its own); None once the faults are printed."""
     from service.api.api_keys import BadKeys, KeyFile
     from service.config.settings import Settings, unknown_variables
 
     for name, meant in unknown_variables().items():
-        print(f"aicvds serve: {name} is no setting and changes nothing{meant}", file=sys.stderr)
+        _say(f"aicvds serve: {name} is no setting and changes nothing{meant}", logging.WARNING)
     try:
         settings = Settings(**given)
     except ValidationError as error:
@@ -120,6 +127,7 @@ def checked_settings(given: dict[str, Any], host: str) -> Settings | None:
             name = f"--{field.replace('_', '-')}" if field in given else f"AICVDS_{field.upper()}".removesuffix("_")
             _refused(f"{name}: {problem_of(fault)}")
         return None
+    host = host or settings.host
     if settings.keys is None and settings.anonymous == "off" and not _is_loopback(host):
         _refused(
             f"anyone who reaches {host} could control this fleet. Make a key with "
@@ -143,7 +151,7 @@ def _serve(listener: socket.socket, settings: Settings, url: str) -> int:
     hand_back_memory()
     logs.configure(settings.log_level, settings.log_format)
     # A machine reads a log of JSON: it gets no banner.
-    loaded = _say if settings.log_format == "text" else lambda text: None
+    loaded = (lambda text: None) if _logs_json() else _say
     server = Server(partial(_application, settings, url, loaded), settings.log_level)
     server.run(sockets=[listener])
     if isinstance(server.error, _Unusable):
@@ -216,10 +224,18 @@ def _reachable(url: str) -> str:
     return url.replace("//0.0.0.0", f"//{socket.gethostname()}").replace("//[::]", f"//{socket.gethostname()}")
 
 
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+def _say(text: str, level: int = logging.INFO) -> None:
+    """Print to stderr, or log where the log is JSON."""
+    if _logs_json():
+        log.log(level, "%s", text)
+    else:
+        print(text, file=sys.stderr, flush=True)
+
+
+def _logs_json() -> bool:
+    return os.environ.get("AICVDS_LOG_FORMAT") == "json"
 
 
 def _refused(fault: str) -> int:
-    print(f"aicvds serve: {fault}", file=sys.stderr)
+    _say(f"aicvds serve: {fault}", logging.ERROR)
     return 2

@@ -39,7 +39,7 @@ _REMOVED = {"AICVDS_PROCESSES": ": several edges share one PostgreSQL behind a l
 _SIMULATORS = {
     f"AICVDS_{name}"
     for name in (
-        *("API_KEY", "AWAIT_LLM", "BIND", "BUILD_NETWORK", "KEYS_DIR", "PORT", "RUNS", "SCENARIO", "SEED", "USER"),
+        *("API_KEY", "AWAIT_LLM", "BIND", "BUILD_NETWORK", "KEYS_DIR", "RUNS", "SCENARIO", "SEED", "USER"),
         *("LORAWAN_DIR", "MQTT_BROKER", "MQTT_PASSWORD", "READINGS_KEY", "WAIT_S"),
     )
 }
@@ -151,6 +151,9 @@ class Settings(BaseSettings):
     # Most decisions that wait for the LLM. The policy makes further ones immediately: they would only share the LLM's
     # time.
     llm_concurrency: int = Field(64, ge=1, le=10_000)
+    # Address and port of `aicvds serve`. In a container the image sets both.
+    host: str = "127.0.0.1"
+    port: int = Field(8000, ge=0, le=65535)
     # Most concurrent requests; a further one gets a 503 with Retry-After. Several times `llm_concurrency`, so that the
     # policy decides before any request is refused.
     max_requests: int = Field(512, ge=1, le=100_000)

@@ -270,7 +270,8 @@ class Engine:
     def _report(self, decided: RecordedDecision, answer: DecideResponse) -> None:
         """Report an answer to metrics, traces, the log and the mission page."""
         task, choice = decided.task, decided.choice
-        self._metrics.record_decision(answer)
+        trace_id = self._traces.decided(answer)
+        self._metrics.record_decision(answer, trace_id)
         if (measured := task.mission.measured.pop(task.uav.uav_id, None)) is not None:
             self._metrics.record_measured(measured)
         self._metrics.overflow_risk.observe(decided.state.state.overflow_risk)
@@ -280,8 +281,7 @@ class Engine:
             self._metrics.evaluator_timeouts.inc()
         if choice.report is not None:
             self._metrics.llm_trust.observe(choice.report.trust[LLM])
-        self._traces.decided(answer)
-        logs.decided(answer)
+        logs.decided(answer, trace_id)
         self.live.decided(task.mission, task.uav, decided.prompt, answer)
 
 

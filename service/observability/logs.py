@@ -122,8 +122,8 @@ def hurry() -> None:
             handler.hurry()
 
 
-def decided(answer: DecideResponse) -> None:
-    """Log an answered decision; at level warning where it was late."""
+def decided(answer: DecideResponse, trace_id: str | None) -> None:
+    """Log an answered decision, with its trace where there is one; at level warning where it was late."""
     late = answer.latency_ms["total"] > answer.deadline_ms
     log.log(
         logging.WARNING if late else logging.INFO,
@@ -141,5 +141,6 @@ def decided(answer: DecideResponse) -> None:
             "total_ms": answer.latency_ms["total"],
             "llm_ms": answer.latency_ms.get("llm"),
             "stored": answer.stored,
+            **({} if trace_id is None else {"trace_id": trace_id}),
         },
     )

@@ -201,11 +201,12 @@ class Metrics:
         self.link_excess_db.observe(measured.excess_db)
         self.radio_failures.inc(measured.radio_failed)
 
-    def record_decision(self, decision: DecideResponse) -> None:
-        """Count one answered decision: source, stages, overhead, tokens, lateness."""
+    def record_decision(self, decision: DecideResponse, trace_id: str | None) -> None:
+        """Count one answered decision: source, stages, overhead, tokens, lateness; its trace is the times' exemplar."""
+        exemplar = None if trace_id is None else {"trace_id": trace_id}
         self._decisions(decision.source, decision.reason or "none").inc()
         for stage, milliseconds in decision.latency_ms.items():
-            self._seconds(stage).observe(milliseconds / 1e3)
+            self._seconds(stage).observe(milliseconds / 1e3, exemplar)
         total = decision.latency_ms["total"]
         self.overhead_seconds.observe((total - decision.latency_ms.get("llm", 0.0)) / 1e3)
         if total > decision.deadline_ms:

@@ -52,13 +52,14 @@ class Traces:
         self._server = _address(settings.llm_url)
         self._vendor = "openai" if settings.llm_url else "llama.cpp"
 
-    def decided(self, answer: DecideResponse) -> None:
-        """Record the spans of a decision that has just been answered, from the times of its consecutive stages.
+    def decided(self, answer: DecideResponse) -> str | None:
+        """Record the spans of a decision that has just been answered, and return the trace's ID as 32 hex digits.
 
-        The decisions of a batch are answered together, so their spans all end now.
+        The spans follow from the times of the decision's consecutive stages. Without a provider there is no ID. The
+        decisions of a batch are answered together, so their spans all end now.
         """
         if self._tracer is None:
-            return
+            return None
         from opentelemetry import trace
         from opentelemetry.trace import SpanKind, Status, StatusCode
 
@@ -82,6 +83,7 @@ class Traces:
             span.end(until)
             started = until
         whole.end(ended)
+        return trace.format_trace_id(whole.get_span_context().trace_id)
 
     def _llm_attributes(self, answer: DecideResponse) -> dict[str, Any]:
         attributes: dict[str, Any] = {

@@ -5,16 +5,23 @@ This module imports nothing slow such as torch.
 
 import asyncio
 import gc
+import logging
+import time
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 from starlette.applications import Starlette
-from starlette.datastructures import MutableHeaders
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from shared.wire.problem import Problem
 
+log = logging.getLogger(__name__)
+
+# Refused requests that are logged a minute: any client can cause them. Of one status, only the first is logged, unless
+# a request has a traceparent.
+_MOST_LOGGED, _MINUTE_S = 60, 60.0
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -26,11 +33,13 @@ _HEADERS = {
 class SecurityHeaders:
     """Pure ASGI middleware: a browser does not cache answers, frame them, or guess another content type.
 
-    A HEAD request is answered as GET; the server leaves out the body. A stream of events has no HEAD.
+    A HEAD request is answered as GET; the server leaves out the body. A stream of events has no HEAD. Refused requests
+    are logged with their ``traceparent``.
     """
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
+        self._minute_ends, self._logged = 0.0, list[int]()
 
     # A plain function that returns the application's coroutine saves a coroutine per request.
     def __call__(self, scope: Scope, receive: Receive, send: Send) -> Awaitable[None]:
@@ -39,6 +48,8 @@ class SecurityHeaders:
                 headers = MutableHeaders(scope=message)
                 for name, value in _HEADERS.items():
                     headers.setdefault(name, value)
+                if message["status"] >= 400:
+                    self._log_refusal(scope, message["status"])
             await send(message)
 
         if scope["type"] != "http":
@@ -47,6 +58,16 @@ class SecurityHeaders:
         if scope["method"] == "HEAD" and not scope["path"].endswith("/events"):
             scope = {**scope, "method": "GET"}
         return self.app(scope, receive, send_with_headers)
+
+    def _log_refusal(self, scope: Scope, status: int) -> None:
+        now = time.monotonic()
+        if now >= self._minute_ends:
+            self._minute_ends, self._logged = now + _MINUTE_S, []
+        traceparent = Headers(scope=scope).get("traceparent")
+        if len(self._logged) < _MOST_LOGGED and (traceparent or status not in self._logged):
+            self._logged.append(status)
+            about = {"method": scope["method"], "path": scope["path"][:200], "status": status}
+            log.info("refused a request", extra=about | ({"traceparent": traceparent[:200]} if traceparent else {}))
 
 
 # As in service.api.routes.

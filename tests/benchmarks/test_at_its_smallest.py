@@ -54,9 +54,9 @@ def test_page_counts_frames_and_updates(tmp_path: Path) -> None:
 
 def test_soak_counts_decisions_and_resources(tmp_path: Path) -> None:
     little = ("--minutes", "0.2", "--pace-s", "0", "--guided", "0", "--missions", "4", "--warm", "9", "3")
-    little += ("--hostile", "2", "--counted-s", "2")
+    counted = ("--hostile", "2", "--counted-s", "2")
     out = tmp_path / "soak.json"
-    found = figures("benchmarks.soak", *little, out=out, codes=(0, 1))
+    found = figures("benchmarks.soak", *little, *counted, out=out, codes=(0, 1))
     assert found["missions"] == 4 and found["decisions"] > 0
     assert min(found["resident_mb"]) > 50 and min(found["files"]) > 0
     assert found["hostile_connections_ended"]["vanishing"] > 0

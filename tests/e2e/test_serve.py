@@ -16,6 +16,7 @@ from typing import Any
 import httpx
 import pytest
 
+from tests.support.edge_stub import free_port
 from tests.support.processes import output_until, run, run_here, serving_edge, started
 from tests.support.running import listening
 from tests.support.stub_llm import misbehaving, wait_for
@@ -67,7 +68,7 @@ def test_every_command_explains_itself(command: str) -> None:
     ("args", "env", "said"),
     [
         (["sail"], {}, "no command 'sail'"),
-        (["serve", "--port", "70000"], {}, "--port 70000"),
+        (["serve", "--port", "70000"], {}, "--port: must be less than or equal to 65535"),
         (["serve"], {"AICVDS_TOP_K": "0"}, "AICVDS_TOP_K"),
         (["serve"], {"AICVDS_LLM_URL": "localhost:8080"}, "AICVDS_LLM_URL"),
         (["model", "fly"], {}, "aicvds model fetch"),
@@ -112,6 +113,23 @@ def test_a_misspelt_setting_is_told() -> None:
         replaced = "AICVDS_PROCESSES is no setting and changes nothing: several edges share one PostgreSQL"
         misspelt = "AICVDS_TOPK is no setting and changes nothing; did you mean AICVDS_TOP_K?"
         output_until(process, rf"{replaced}[^\0]*{re.escape(misspelt)}")
+
+
+def test_host_port_and_every_line_of_a_json_log_come_from_the_environment() -> None:
+    port = str(free_port())
+    env = {"AICVDS_HOST": "::1", "AICVDS_PORT": port, "AICVDS_LOG_FORMAT": "json", "AICVDS_TOPK": "3"}
+    with started("serve", AICVDS_MODE="policy", **env) as process:
+        url = f"http://[::1]:{port}"
+        seen = output_until(process, rf"listening on {re.escape(url)}").string
+        until(lambda: httpx.get(f"{url}/readyz", timeout=PATIENCE_S).is_success)
+        process.terminate()
+        seen += process.communicate(timeout=PATIENCE_S)[0]
+    lines = [json.loads(line) for line in seen.splitlines()]
+    assert "AICVDS_TOPK is no setting" in lines[0]["event"] and lines[0]["level"] == "warning"
+    env |= {"AICVDS_PORT": "tcp://10.0.0.7:8000", "AICVDS_MODE": "fast"}
+    faults = [json.loads(line) for line in run("serve", **env).stderr.splitlines()]
+    assert [fault["event"].split(":")[1].strip() for fault in faults[1:]] == ["AICVDS_MODE", "AICVDS_PORT"]
+    assert {fault["level"] for fault in faults[1:]} == {"error"}
 
 
 def test_nothing_runs_before_the_settings_are_checked(tmp_path: Path) -> None:

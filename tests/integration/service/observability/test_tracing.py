@@ -110,8 +110,14 @@ def test_a_decision_is_a_trace_under_its_callers(report: Report) -> None:
         headers = {"traceparent": f"00-{trace}-{parent}-01"}
         answer = client.post("/decide", json=report(), headers=headers).json()
         assert answer["source"] == "llm"
+        assert client.post("/decide", json={}, headers=headers).status_code == 422
+        measured = client.get("/metrics", headers={"Accept": "application/openmetrics-text"}).text
         process.terminate()
-        process.communicate(timeout=PATIENCE_S)
+        logged = process.communicate(timeout=PATIENCE_S)[0]
+    total = [line for line in measured.splitlines() if line.startswith('aicvds_decision_seconds_bucket{le="')]
+    assert any(f'# {{trace_id="{trace}"}}' in line for line in measured.splitlines()), total
+    assert f"trace_id={trace}" in logged
+    assert any("refused a request" in line and headers["traceparent"] in line for line in logged.splitlines())
     whole = next(span for span in spans if span.name == "decide")
     assert (whole.trace_id.hex(), whole.parent_span_id.hex()) == (trace, parent)
     assert told(whole)["aicvds.decision_id"] == answer["decision_id"]
