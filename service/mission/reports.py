@@ -16,11 +16,14 @@ from shared.wire.schemas import SensorColumns, UavState
 from shared.wire.sensor_arrays import arrays_of
 from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario
+from shared.world.trajectory import progress_of, trajectories
 
 AnyReport = TypeVar("AnyReport", bound=UavState)
 
 # The columns of a reference report, in this order.
 _COLUMNS = ("id", "queue", "battery", "channel_gain", "last_seen")
+# A UAV and its sensors within so many metres of each other are a pipeline in degrees.
+_DEGREES_APART = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +59,9 @@ class Reports:
             at: the path of the UAV in the request's body, such as ``uavs[1].``.
 
         Raises:
-            Refused: a step far past the newest one, an unknown UAV or sensor, a queue past its capacity, a beacon later
-                than the step, an outcome of another UAV's decision, a change of a sensor that the reference lacks, or a
-                reference later than the step.
+            Refused: a step far past the newest one, an unknown UAV or sensor, positions in degrees, a queue past its
+                capacity, a beacon later than the step, an outcome of another UAV's decision, a change of a sensor that
+                the reference lacks, or a reference later than the step.
             Incomplete: the edge has no such reference report, or does not know a sensor's position.
             NotFound: an outcome of a decision that the mission does not know.
         """
@@ -68,6 +71,7 @@ class Reports:
             raise Refused(f"{at}uav_id", f"UAV {report.uav_id} is unknown: this mission has {scenario.uavs}, from 0")
         if (highest := max(report.sensors.id, default=0)) >= scenario.sensors:
             raise Refused(f"{at}sensors.id", f"sensor {highest} is unknown: there are {scenario.sensors}, from 0")
+        self._check_metres(report, at)
         if report.base is not None or not report.sensors.x:
             report = self._in_full(report, step, at)
         sensors = arrays_of(report.sensors)
@@ -131,6 +135,27 @@ class Reports:
                 f"step {step} is more than {ahead} past {newest}, the newest step known of mission {self._mission_id}: "
                 "DELETE the mission if its fleet was out of contact for so long",
             )
+
+    def _check_metres(self, report: UavState, at: str) -> None:
+        """Refuse longitudes and latitudes, of which the edge would only see that every sensor is near.
+
+        Either all places are within 2 m of each other, or a UAV's first position has parts of a millimetre and is off
+        its trajectory.
+        """
+        places = [tuple(report.position), *zip(report.sensors.x or (), report.sensors.y or (), strict=True)]
+        if any(abs(x) > 180 or abs(y) > 90 for x, y in places[:1]):
+            return
+        lowest, highest = np.min(places, axis=0), np.max(places, axis=0)
+        if len(set(places)) < 3 or (highest - lowest).max() >= _DEGREES_APART:
+            path = trajectories(self._scenario)[report.uav_id]
+            exact = all(round(value, 3) != value for value in report.position)
+            if report.uav_id in self._belief.uavs or not exact or progress_of(path, report.position) is not None:
+                return
+        raise Refused(
+            f"{at}position",
+            f"{report.position[0]:g}, {report.position[1]:g} looks like degrees: the mission's world is in metres from "
+            "its corner, x to the east and y to the north. Metres that are meant are sent in whole millimetres",
+        )
 
     def _reference(self, uav: UavState, step: int, at: str) -> ReferenceReport:
         reference = self._references.get(uav.uav_id)

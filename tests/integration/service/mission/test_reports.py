@@ -53,6 +53,20 @@ def refusal(client: httpx.Client, body: Body, path: str = "/decide") -> tuple[in
     return answer.status_code, problem["type"], problem["errors"][0]["field"]
 
 
+def test_degrees_are_refused_and_metres_near_the_corner_are_not(edge: Edge, report: Report) -> None:
+    client, sensors = edge(), report()["sensors"]
+    client.put("/missions/test", json={}).raise_for_status()
+    longitudes, latitudes = [41.2949, 41.2962, 41.2974, 41.2983, 41.2992], [39.8965, 39.8970, 39.8978, 39.8987, 39.8998]
+    in_degrees = report(position=[41.3012345, 39.9023456], sensors={**sensors, "x": longitudes, "y": latitudes})
+    assert refusal(client, in_degrees) == (422, "about:blank", "position")
+    # The sensors are in metres, or their places are known.
+    assert refusal(client, report(position=[41.3012345, 39.9023456])) == (422, "about:blank", "position")
+    for position in ([41.301, 39.902], [41.0, 39.9023456], [180.5123456, 39.9023456]):
+        asked(client, report(position=position))
+    # A UAV that has flown in metres goes on in metres.
+    asked(client, report(step=1, position=[41.3012345, 39.9023456]))
+
+
 @pytest.mark.parametrize("belief", ["fleet", "reported"])
 def test_what_changed_decides_as_all_of_it(edge: Edge, report: Report, belief: str) -> None:
     clients = [edge(), edge()]
