@@ -36,7 +36,7 @@ class ExperimentOptions:  # noqa: D101
     A scheme's mission in a world is stored in --out's flights/ and never flown twice: experiments share it, and the
     same command continues after Ctrl-C or a crash. The command starts the edges that it needs. Written to --out/NAME:
     results.json (means with 95% bootstrap intervals over seeds, comparisons paired by seed), results.csv (a line a
-    scheme, seed and measure), and the figures.
+    scheme and seed, a column a measure), and the figures.
 
     Try it:  python -m lab experiment scheduler --quick
 
@@ -184,6 +184,9 @@ def _check_schemes(chosen: list[Experiment], setup: Setup) -> None:
 
 
 def _commands(name: str, argv: list[str]) -> Callable[[Experiment], str]:
+    """The command that makes one experiment, as its result names it: without the folder, which changes no number."""
     rest = list(argv)
     rest.remove(name)
+    if "--out" in rest:
+        del rest[rest.index("--out") : rest.index("--out") + 2]
     return lambda experiment: shlex.join(["python", "-m", "lab", "experiment", experiment.name, *rest])

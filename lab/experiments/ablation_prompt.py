@@ -38,6 +38,6 @@ EXPERIMENT = Experiment(
         FigureSpec("ablation_prompt", "bars", LOSSES, "Losses by the rows' order and the experiences kept."),
         FigureSpec("ablation_prompt_cost", "bars", ("prompt_tokens", "rtt_p50"), "What each prompt costs."),
     ),
-    reference="_".join(map(str, _BASE)),
+    references=("_".join(map(str, _BASE)),),
     notes=("Mode llm, k = 5. Experiences are those kept at most; the older half is dropped when there are more.",),
 )

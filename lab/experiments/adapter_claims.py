@@ -46,7 +46,7 @@ EXPERIMENT = Experiment(
         FigureSpec("adapter_claims", "curves", LOSS_CURVES, "Lost packets and loss events, by step."),
         FigureSpec("adapter_claims_k", "sweep", ("lost_packets",), "Lost packets over k, with the adapter."),
     ),
-    reference="llm",
+    references=("llm",),
     paired_measures=("lost_packets",),
     sweep=Sweep(label="sensors kept, k", at={"llm": float(_TOP_K)} | {f"k{k}": float(k) for k in _OTHER_KS}),
     notes=(

@@ -16,7 +16,7 @@ EXPERIMENT = Experiment(
         FigureSpec("aoi", "curves", ("aoi_per_step",), "Age of information, mean over the sensors."),
         FigureSpec("aoi_totals", "bars", ("aoi_mean", "aoi_peak"), "Mean and peak age of information of a mission."),
     ),
-    reference="nearest",
+    references=("nearest",),
     paired_measures=("aoi_mean", "aoi_peak", "lost_packets"),
     when_quick="no_llm",
     notes=(

@@ -34,8 +34,8 @@ def comparisons(experiment: Experiment, flying: Sequence[Group], groups: Sequenc
         groups: these, and the bound.
     """
     by_site = {(group.scheme.name, group.site): group for group in flying}
-    reference = experiment.reference
-    pairs = [(g.scheme.name, reference) for g in flying if reference and g.scheme.name != reference]
+    names = [group.scheme.name for group in flying]
+    pairs = [(name, reference) for reference in experiment.references for name in names if name != reference]
     found = Comparisons()
     for name, other in dict.fromkeys([*pairs, *experiment.pairs]):
         for site in dict.fromkeys(group.site for group in flying):

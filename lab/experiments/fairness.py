@@ -17,7 +17,7 @@ EXPERIMENT = Experiment(
             "fairness_and_loss", "bars", ("jain", "lost_packets"), "Jain's index, and the packets lost meanwhile."
         ),
     ),
-    reference="random",
+    references=("random",),
     paired_measures=("jain", "jain_scheduled", "lost_packets"),
     when_quick="no_llm",
     notes=(

@@ -26,7 +26,6 @@ def findings(
     plan: ExperimentPlan,
     setup: Setup,
     command: str,
-    commit: str | None,
     load: Callable[[str], FlightRecord | None],
     notes: Sequence[str],
 ) -> Result:
@@ -51,7 +50,7 @@ def findings(
         title=experiment.title,
         command=command,
         version=version("aic-vds"),
-        commit=commit,
+        commit=", ".join(sorted({str(flight.commit) for group in groups for flight in group.flights})),
         created_at=max(flight.flown_at for group in groups for flight in group.flights),
         quick=setup.quick,
         scenario=", ".join(dict.fromkeys(group.flights[0].scenario for group in flying)),
@@ -70,15 +69,16 @@ def findings(
 
 
 def tidy(result: Result) -> str:
-    """``results.csv``: one line a scheme, seed and measure, and one a seed for the bound."""
+    """``results.csv``: one line a scheme and seed, and one a seed for the bound; a column a measure."""
     text = StringIO()
+    found = {**result.schemes, BOUND.name: _once(result.bound)}
+    measures = list(dict.fromkeys(measure for of_scheme in found.values() for measure in of_scheme))
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(["experiment", "scheme", "seed", "measure", "value"])
-    for scheme, measures in {**result.schemes, BOUND.name: _once(result.bound)}.items():
-        for measure, found in measures.items():
-            seeds = result.seeds_of.get(scheme, result.seeds)
-            for seed, value in zip(seeds, found.values, strict=True):
-                rows.writerow([result.experiment, scheme, seed, measure, f"{value:g}"])
+    rows.writerow(["scheme", "seed", *measures])
+    for scheme, of_scheme in found.items():
+        for number, seed in enumerate(result.seeds_of.get(scheme, result.seeds) if of_scheme else ()):
+            values = (f"{of_scheme[m].values[number]:g}" if m in of_scheme else "" for m in measures)
+            rows.writerow([scheme, seed, *values])
     return text.getvalue()
 
 
@@ -176,12 +176,6 @@ def _notes(plan: ExperimentPlan, setup: Setup, groups: Sequence[Group]) -> list[
     notes += _below_bound(groups)
     if any(isinstance(group.scheme.decides, OverEdge) for group in groups):
         notes.append("The edge's modules learn beside its decisions: a mission flown anew may differ a little.")
-    commits = {flight.commit for group in groups for flight in group.flights}
-    if len(commits) > 1:
-        notes.append(
-            f"Flights of several commits: {', '.join(sorted(str(c) for c in commits))}. "
-            "Delete the folder flights/ to fly all of them with one."
-        )
     return notes
 
 

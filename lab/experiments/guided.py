@@ -47,10 +47,8 @@ EXPERIMENT = Experiment(
         FigureSpec("guided", "curves", LOSS_CURVES, "Lost packets and loss events, per step and cumulative."),
         FigureSpec("guided_totals", "bars", LOSSES, "Lost packets and loss events of a mission."),
     ),
-    reference="edge_planner",
+    references=("edge_planner", "eof", "wqcs"),
     pairs=(
-        ("guided", "eof"),
-        ("guided", "wqcs"),
         ("guided", "max_gain"),
         ("guided", "madqn"),
         ("guided", "mappo"),

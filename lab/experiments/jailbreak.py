@@ -29,7 +29,7 @@ EXPERIMENT = Experiment(
     schemes=_schemes,
     measures=(*LOSSES, "failures", "overflows", "llm_decided_pct"),
     figures=(FigureSpec("jailbreak", "bars", LOSSES, "Losses with the rule verifier and without, mode llm, k = 5."),),
-    reference="turned_off",
+    references=("turned_off",),
     pairs=(("turned_on", "turned_off"), ("draws_on", "draws_off"), ("llm_rules_on", "llm_rules_off")),
     notes=(
         "Nothing but numbers and the operator's note reaches the prompt, so a sensor cannot talk to the LLM; this is "

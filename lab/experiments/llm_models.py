@@ -38,7 +38,7 @@ EXPERIMENT = Experiment(
         FigureSpec("llm_models", "bars", LOSSES, "Losses by the LLM that decides, k = 5."),
         FigureSpec("llm_models_latency", "bars", ("rtt_p50",), "Median round trip by the LLM that decides."),
     ),
-    reference="llm_chance",
+    references=("llm_chance",),
     notes=(
         "Only models at hand are measured: SmolLM2-135M is the one that ships; give others with --model FILE.gguf. "
         "What a larger model would do is not known from this.",

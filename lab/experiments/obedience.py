@@ -69,7 +69,7 @@ EXPERIMENT = Experiment(
         FigureSpec("obedience_losses", "bars", LOSSES, "What obeying costs: losses of a mission."),
     ),
     when_quick="no_llm",
-    reference="guided_nothing",
+    references=("guided_nothing",),
     pairs=(
         ("llm_note", "llm_nothing"),
         ("llm_adapted_note", "llm_adapted_nothing"),

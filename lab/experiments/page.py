@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from pydantic import ValidationError
@@ -16,33 +18,38 @@ from tyro.conf import arg
 from lab.experiments import claims, jain
 from lab.experiments.catalogue import EXPERIMENTS
 from lab.experiments.evidence import ZERO, flew_all
+from lab.experiments.findings import tidy
 from lab.experiments.plots import draw, label_of, measured
 from lab.experiments.result import Figure, Interval, Result
-from lab.experiments.tables import cell, measure_tables, pair_tables, row_label
+from lab.experiments.tables import cell, tables_of
 from shared.world.scenario import Scenario
 from simulator.commands.running import command_main
 from simulator.errors import UsageError
 from simulator.records.run_folder import naming_out
 
 RESULT = "results.json"
-FIGURES = "figures"
+FIGURES, DATA = "figures", "data/experiments"
+# Digits of the page's numbers in its data: more than a page or a verdict needs.
+_DIGITS = 6
 
 
 @dataclass(frozen=True)
 class PageOptions:
-    """Write the results page: the paper's numbers beside ours, and every experiment's figures and tables.
+    """Write the results page: the paper's numbers beside ours, and every experiment's table and figure.
 
-    Experiments that were not run are listed as such. The command replaces an existing page and its figures.
+    The page is made from the results in the folder data/experiments beside it. With --runs the command first takes the
+    results of new runs into that folder, where they replace older ones of the same experiment. It lists experiments
+    without a result as not flown.
 
-    Try it:  python -m lab experiment page --runs runs/experiments --out docs/results/experiments.md
+    Try it:  python -m lab experiment page --runs runs/experiments
 
     Exit code: 0 written, 2 bad use.
     """
 
-    runs: Annotated[Path, arg(metavar="DIR")] = Path("runs/experiments")
-    """Folder of the experiments' results (their --out)."""
+    runs: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Folder of new results (the experiments' --out). Default: none, the page is made again."""
     out: Annotated[Path, arg(metavar="FILE.md")] = Path("docs/results/experiments.md")
-    """The page; its figures go to the folder figures beside it."""
+    """The page; its figures and data go to folders beside it."""
 
 
 def main(argv: list[str]) -> int:
@@ -56,20 +63,32 @@ def _page(options: PageOptions, console: Console) -> int:
     return 0
 
 
-def write_page(runs: Path, out: Path) -> None:
-    """Write the Markdown page ``out``, and its figures into the folder ``figures`` beside it.
+def write_page(runs: Path | None, out: Path) -> None:
+    """Write the Markdown page ``out``, and its figures and data into folders beside it.
 
     Args:
-        runs: the folder of ``python -m lab experiment``. The page lists experiments without a result as not run.
+        runs: the folder of ``python -m lab experiment`` with new results, if any.
 
     Raises:
-        UsageError: the folder has no result, a result cannot be read, or the page cannot be written.
+        UsageError: there is no result, one cannot be read, or the page cannot be written.
     """
-    found = results_in(runs)
+    data = out.parent / DATA
+    new = [*results_in(runs).values()] if runs else []
     with naming_out(out):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        drawn = {name: _figures(result, out.parent / FIGURES / name) for name, result in found.items()}
+        data.mkdir(parents=True, exist_ok=True)
+        for result in _latest([*stored_in(data).values(), *new]).values():
+            (data / f"{result.experiment}.json").write_text(_short(result), encoding="utf-8")
+            (data / f"{result.experiment}.csv").write_text(tidy(result), encoding="utf-8")
+        found = stored_in(data)
+        if not found:
+            raise UsageError(f"{data} has no results; take some in with --runs DIR")
+        drawn = {name: _drawn(result, out.parent / FIGURES / name) for name, result in found.items()}
         out.write_text(render_page(found, drawn, out.parent), encoding="utf-8")
+
+
+def stored_in(data: Path) -> dict[str, Result]:
+    """The results that a page is made from, by experiment; raises ``UsageError`` for one that cannot be read."""
+    return _latest([_read(path) for path in sorted(data.glob("*.json"))])
 
 
 def results_in(runs: Path) -> dict[str, Result]:
@@ -81,8 +100,27 @@ def results_in(runs: Path) -> dict[str, Result]:
     paths = sorted([*runs.glob(RESULT), *runs.glob(f"*/{RESULT}")])
     if not paths:
         raise UsageError(f"--runs {runs} has no {RESULT}; make some with: python -m lab experiment all --out {runs}")
-    results = sorted((_read(path) for path in paths), key=lambda result: (not result.quick, result.created_at))
-    return {result.experiment: result for result in results}
+    return _latest([_read(path) for path in paths])
+
+
+def _latest(results: Sequence[Result]) -> dict[str, Result]:
+    in_order = sorted(results, key=lambda result: (not result.quick, result.created_at))
+    return {result.experiment: result for result in in_order}
+
+
+def _short(result: Result) -> str:
+    """The result as JSON, with an entry a line and rounded numbers."""
+
+    def rounded(value: Any) -> Any:
+        if isinstance(value, float):
+            return float(f"{value:.{_DIGITS}g}")
+        if isinstance(value, dict):
+            return {key: rounded(each) for key, each in value.items()}
+        return [rounded(each) for each in value] if isinstance(value, list) else value
+
+    fields = rounded(result.model_dump(mode="json", exclude_defaults=True))
+    lines = (f'"{name}":{json.dumps(value, separators=(",", ":"))}' for name, value in fields.items())
+    return "{" + ",\n".join(lines) + "}\n"
 
 
 def _read(path: Path) -> Result:
@@ -94,11 +132,16 @@ def _read(path: Path) -> Result:
         raise UsageError(f"{path}: {why}; run that experiment again") from None
 
 
-def _figures(result: Result, folder: Path) -> list[tuple[Figure, Path]]:
+def _drawn(result: Result, folder: Path) -> list[tuple[Figure, Path]]:
     for stale in folder.glob("*.svg"):
         stale.unlink()
-    paths = {path.stem: path for path in draw(result, folder, ("svg",))}
-    return [(figure, paths[figure.name]) for figure in result.figures if figure.name in paths]
+    paths = {path.stem: path for path in draw(result.model_copy(update={"figures": shown(result)}), folder, ("svg",))}
+    return [(figure, paths[figure.name]) for figure in shown(result) if figure.name in paths]
+
+
+def shown(result: Result) -> list[Figure]:
+    """The figure on the page: the first without curves if there is one, for curves of many schemes hide each other."""
+    return sorted(result.figures, key=lambda figure: figure.kind == "curves")[:1]
 
 
 def render_page(results: Mapping[str, Result], drawn: Mapping[str, Sequence[tuple[Figure, Path]]], folder: Path) -> str:
@@ -109,19 +152,24 @@ def render_page(results: Mapping[str, Result], drawn: Mapping[str, Sequence[tupl
     )  # fmt: skip
     environment.filters.update(cell=cell, rounded=rounded, seeds=seeds_text)
     full = {name: result for name, result in results.items() if not (result.quick or claims.elsewhere(result))}
-    findings = claims.judge(results)
+    often = Counter(note for result in results.values() for note in result.notes)
+    judged = {
+        "the LLM of `--llm`": claims.judge(results),
+        "the LLM with its adapter": claims.judge_with_adapter(results),
+    }
     return environment.get_template("results.md.j2").render(
-        findings=findings,
-        adapted=claims.judge_with_adapter(results),
-        verdicts={v: sum(f.verdict is v for f in findings) for v in claims.Verdict},
+        judged={llm: found for llm, found in judged.items() if any(f.verdict and f.model for f in found)},
+        verdicts=list(claims.Verdict),
+        common=[note for note, times in often.items() if times > 1],
         experiments=[*EXPERIMENTS, *sorted(results.keys() - set(EXPERIMENTS))],
+        missing=[name for name in EXPERIMENTS if name not in results],
         results=results,
         figures={
             name: [(figure, Path(os.path.relpath(path, folder)).as_posix()) for figure, path in pictures]
             for name, pictures in drawn.items()
         },
-        measure_tables=measure_tables,
-        pair_tables=pair_tables,
+        tables_of=tables_of,
+        data=DATA,
         fairness=Fairness.of(results.get("fairness")),
         claims=claims,
         zero=ZERO,
@@ -135,13 +183,9 @@ def render_page(results: Mapping[str, Result], drawn: Mapping[str, Sequence[tupl
 
 @dataclass(frozen=True)
 class Evenness:
-    """One scheme's Jain's index of visits served and of visits scheduled, and its lost packets.
-
-    ``on_all_seeds``: whether it flew every world of the result, so that its mean can be compared with others'.
-    """
+    """Jain's index of visits served and of visits scheduled, and the lost packets, of a scheme that flew all worlds."""
 
     label: str
-    on_all_seeds: bool
     served: Interval
     scheduled: Interval | None
     lost: Interval | None
@@ -149,7 +193,7 @@ class Evenness:
 
 @dataclass(frozen=True)
 class Fairness:
-    """Jain's index by chance, by need, and as measured, the most even scheme first."""
+    """Jain's index by chance, by need, and as measured, the most even scheme first; only of full runs."""
 
     visits: int
     sensors: int
@@ -160,7 +204,6 @@ class Fairness:
     by_need: float
     rows: list[Evenness]
     random: Evenness | None
-    quick: bool
 
     @classmethod
     def of(cls, result: Result | None) -> Fairness:
@@ -169,14 +212,13 @@ class Fairness:
         visits = paper.uavs * paper.steps
         by_name = {
             name: Evenness(
-                row_label(result, name),
-                flew_all(result, name),
+                label_of(result, name),
                 served,
                 measured(result, name, "jain_scheduled"),
                 measured(result, name, "lost_packets"),
             )
             for name in (result.schemes if result else ())
-            if result and (served := measured(result, name, "jain"))
+            if result and not result.quick and flew_all(result, name) and (served := measured(result, name, "jain"))
         }
         return cls(
             visits=visits,
@@ -188,18 +230,17 @@ class Fairness:
             by_need=jain.of_proportional_visits(paper.arrival_rate_min, paper.arrival_rate_max, paper.sensors),
             rows=sorted(by_name.values(), key=lambda row: -row.served.mean),
             random=by_name.get("random"),
-            quick=result is not None and result.quick,
         )
 
     @property
     def most_even(self) -> Evenness | None:
-        """The most even of the schemes that flew all worlds; ``None`` if there is none."""
-        return next((row for row in self.rows if row.on_all_seeds), None)
+        """The most even of the schemes; ``None`` if there is none."""
+        return next(iter(self.rows), None)
 
     @property
     def least_lossy(self) -> Evenness | None:
         """The scheme of those with the fewest lost packets; ``None`` without measured losses."""
-        losses = [(row.lost.mean, index) for index, row in enumerate(self.rows) if row.lost and row.on_all_seeds]
+        losses = [(row.lost.mean, index) for index, row in enumerate(self.rows) if row.lost]
         return self.rows[min(losses)[1]] if losses else None
 
 

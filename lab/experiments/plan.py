@@ -62,10 +62,11 @@ class Experiment:
     """The declaration of one figure or table of the paper, or of one beyond it.
 
     ``summary`` is its line in ``--help``. ``measures``, and the measures of curves in ``figures``, are names in
-    ``measures.py``. Every other scheme is paired with ``reference``; ``pairs`` are further pairs. With ``when_quick``
-    of ``short``, ``--quick`` shortens the missions of all schemes, so that they stay comparable; with ``no_llm`` it
-    omits the schemes that query an LLM. ``worlds`` are the setup's sites that it flies beside the first one. On each
-    site, the one of ``heuristics`` with the fewest lost packets is another reference for every other scheme.
+    ``measures.py``. Every other scheme is paired with each of ``references``; ``pairs`` are further pairs. With
+    ``when_quick`` of ``short``, ``--quick`` shortens the missions of all schemes, so that they stay comparable; with
+    ``no_llm`` it omits the schemes that query an LLM. ``worlds`` are the setup's sites that it flies beside the first
+    one. On each site, the one of ``heuristics`` with the fewest lost packets is another reference for every other
+    scheme.
     """
 
     name: str
@@ -74,7 +75,7 @@ class Experiment:
     schemes: Callable[[Setup], list[Scheme]]
     measures: tuple[str, ...]
     figures: tuple[FigureSpec, ...]
-    reference: str | None = None
+    references: tuple[str, ...] = ()
     pairs: tuple[tuple[str, str], ...] = ()
     paired_measures: tuple[str, ...] = ("lost_packets", "events")
     sweep: Sweep | None = None

@@ -63,7 +63,7 @@ class Result(Record):
     ``schemes`` is by the name of the scheme, then of the measure, in display order. ``labels`` are the labels of
     schemes and measures. ``seeds_of`` has the schemes that flew fewer seeds than the rest. ``bound`` is the proven
     lower bound of each measure, a separate line and no scheme. In a result of several sites a measure's name ends with
-    ``@`` and the site's.
+    ``@`` and the site's. ``commit`` is that of the flights, or all of them, with commas between.
     """
 
     experiment: str

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from lab.executors import executor
 from lab.experiments.edges import edge_for
-from lab.experiments.execution import CannotFly, commit, fly_locally, fly_with_edge
+from lab.experiments.execution import CannotFly, fly_locally, fly_with_edge
 from lab.experiments.flight import FlightRecord, FlightStore
 from lab.experiments.measures import substituted_decisions
 from lab.experiments.pace import Pace, duration_text
@@ -153,7 +153,7 @@ class Run:
         from lab.experiments.plots import draw
 
         notes = [f"{label} cannot fly: {why}" for label, why in self.grounded.items() if _concerns(plan, label)]
-        result = findings(plan, self.setup, self.command_of(plan.experiment), commit(), self.store.load, notes)
+        result = findings(plan, self.setup, self.command_of(plan.experiment), self.store.load, notes)
         folder = self.out / plan.experiment.name
         with naming_out(folder):
             folder.mkdir(parents=True, exist_ok=True)

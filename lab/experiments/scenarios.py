@@ -37,8 +37,7 @@ EXPERIMENT = Experiment(
         FigureSpec("scenarios_packets", "bars", ("lost_packets",), "Lost packets of a mission by scenario."),
         FigureSpec("scenarios_events", "bars", ("events",), "Loss events of a mission by scenario."),
     ),
-    reference="eof",
-    pairs=(("guided", "wqcs"), ("guided_chance", "wqcs")),
+    references=("eof", "wqcs"),
     worlds=("paper", "pipeline", "stress", "dense", "lossy_uplink"),
     notes=(
         "`LLM draws` answers a uniform draw of the letters offered: what mode guided brings whatever the LLM.",

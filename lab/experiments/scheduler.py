@@ -21,7 +21,7 @@ EXPERIMENT = Experiment(
         FigureSpec("scheduler", "curves", LOSS_CURVES, "Lost packets and loss events, per step and cumulative."),
         FigureSpec("scheduler_totals", "bars", LOSSES, "Lost packets and loss events of a mission."),
     ),
-    reference="eof",
+    references=("eof", "wqcs"),
     notes=(
         "EOF and WQCS are the paper's. The longest queue, queue and channel, maximum channel gain, nearest neighbour "
         "and round robin choose the sensor only, at a constant 7 m/s; `at full speed` is the same choice at the "

@@ -1,136 +1,113 @@
-"""The results page's tables: a result's measures and its paired comparisons, each narrow enough for a page.
+"""The results page's tables: a result's first measures and its ratios on the same worlds, narrow enough for a page.
 
-Measures of one scenario have a row a scheme and a column a measure. A measure of several scenarios has its own table,
-with a column a scenario.
+A result of one scenario has one table, with a row a scheme. One of several scenarios has a column a scenario, in a
+table of its first measure and in one of the ratios to each reference. The data files have every measure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 from lab.experiments.claims import CLAIM_SEEDS
 from lab.experiments.evidence import seeds_flown
 from lab.experiments.plots import BOUND_LABEL, label_of, measured
 from lab.experiments.result import Interval, Paired, Result
 
-COLUMNS = 6
+MEASURES, REFERENCES = 4, 3
 NONE, FEW = "–", " †"
+# The measure whose ratios are shown, where it is compared at all.
+_LOST = "lost_packets"
 
 Found = Interval | Paired | None
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table to print, with a cell a row and column.
-
-    ``caption`` may be empty. A table without rows consists of its caption.
-    """
+    """A table to print, with a cell a row and column; ``caption`` may be empty."""
 
     caption: str
     columns: list[str]
     rows: list[list[str]]
 
 
-def measure_tables(result: Result) -> list[Table]:
-    """The measures of every scheme; a mark at the label means few seeds."""
+def tables_of(result: Result) -> list[Table]:
+    """The tables of a result; a mark at a scheme's label means few seeds."""
     measures = list(dict.fromkeys(m for found in result.schemes.values() for m in found))
-    if any(_site_of(measure) for measure in measures):
-        return _by_site(result, measures)
-    remaining, tables = iter(measures), []
-    while some := list(islice(remaining, COLUMNS)):
-        rows = {row_label(result, name): [measured(result, name, m) for m in some] for name in result.schemes}
-        if result.bound.keys() & set(some):
-            rows[BOUND_LABEL] = [result.bound.get(m) for m in some]
-        digits = [_digits(column) for column in zip(*rows.values(), strict=True)]
-        texts = [[label, *map(cell, cells, digits)] for label, cells in rows.items()]
-        tables.append(Table("", ["scheme", *(label_of(result, m) for m in some)], texts))
-    return tables
+    sites = list(dict.fromkeys(site for m in measures if (site := m.partition("@")[2])))
+    return _by_site(result, measures[0].partition("@")[0], sites) if sites else [_whole(result, measures)]
 
 
-def _by_site(result: Result, measures: Sequence[str]) -> list[Table]:
-    tables = []
-    for name, sites in _sites_of(measures).items():
-        rows = {
-            row_label(result, scheme): [measured(result, scheme, f"{name}@{site}") for site in sites]
-            for scheme in result.schemes
-        }
-        if any(f"{name}@{site}" in result.bound for site in sites):
-            rows[BOUND_LABEL] = [result.bound.get(f"{name}@{site}") for site in sites]
-        digits = _digits([found for cells in rows.values() for found in cells])
-        texts = {label: [cell(found, digits) for found in cells] for label, cells in rows.items()}
-        caption = _sited_label(result, name, sites[0])
-        values = {text for cells in texts.values() for text in cells} - {NONE}
-        if len(values) == 1:
-            tables.append(Table(f"{caption}: {values.pop()} for every scheme in every scenario", [], []))
-        else:
-            tables.append(Table(caption, ["scheme", *sites], [[label, *cells] for label, cells in texts.items()]))
-    return tables
+def _whole(result: Result, measures: Sequence[str]) -> Table:
+    found = {m: [measured(result, name, m) for name in result.schemes] for m in measures}
+    differing = [m for m, of_schemes in found.items() if len({each and each.mean for each in of_schemes}) > 1]
+    shown = (differing or list(measures))[:MEASURES]
+    rows = {row_label(result, name): [found[m][n] for m in shown] for n, name in enumerate(result.schemes)}
+    digits = [_digits(column) for column in zip(*rows.values(), strict=True)]
+    ratios = _ratios(result, _compared(result))
+    columns = _references(result, ratios)
+    texts = []
+    for name, (label, cells) in zip(result.schemes, rows.items(), strict=True):
+        own = [_ratio(ratios, name, reference) for reference in columns] if columns else _named(result, ratios, name)
+        texts.append([label, *map(cell, cells, digits), *own])
+    if result.bound.keys() & set(shown):
+        least = [cell(result.bound.get(m), places) for m, places in zip(shown, digits, strict=True)]
+        texts.append([BOUND_LABEL, *least, *([NONE] * (len(texts[0]) - len(least) - 1))])
+    heads = [f"to {_label(result, reference)}" for reference in columns] or (["ratio"] if ratios else [])
+    if heads and shown[0] != _compared(result):
+        heads = [f"{label_of(result, _compared(result))}, {head}" for head in heads]
+    return Table("", ["scheme", *(label_of(result, m) for m in shown), *heads], texts)
 
 
-def pair_tables(result: Result) -> list[Table]:
-    """Differences and ratios of schemes on the same worlds."""
-    both: dict[tuple[str, str, str], dict[str, Paired]] = {}
-    for found in result.paired:
-        both.setdefault((found.scheme, found.reference, found.measure), {})[found.kind] = found
-    if any(_site_of(measure) for _, _, measure in both):
-        return _pairs_by_site(result, both)
-    rows = [
-        [
-            label_of(result, scheme),
-            _reference_label(result, reference),
-            label_of(result, measure),
-            *(_pair_cell(kinds.get(kind)) for kind in ("difference", "ratio")),
+def _by_site(result: Result, measure: str, sites: Sequence[str]) -> list[Table]:
+    caption = label_of(result, f"{measure}@{sites[0]}").removesuffix(f", {sites[0]}")
+    rows = {
+        row_label(result, name): [measured(result, name, f"{measure}@{site}") for site in sites]
+        for name in result.schemes
+    }
+    if any(f"{measure}@{site}" in result.bound for site in sites):
+        rows[BOUND_LABEL] = [result.bound.get(f"{measure}@{site}") for site in sites]
+    digits = _digits([found for cells in rows.values() for found in cells])
+    texts = [[label, *(cell(found, digits) for found in cells)] for label, cells in rows.items()]
+    tables = [Table(caption, ["scheme", *sites], texts)]
+    at = {site: _ratios(result, f"{measure}@{site}") for site in sites}
+    for reference in _references(result, {key: pair for ratios in at.values() for key, pair in ratios.items()}):
+        texts = [
+            [label_of(result, name), *(_ratio(at[site], name, reference) for site in sites)] for name in result.schemes
         ]
-        for (scheme, reference, measure), kinds in both.items()
-    ]
-    return [Table("", ["scheme", "against", "measure", "difference", "ratio"], rows)] if rows else []
-
-
-def _pairs_by_site(result: Result, both: Mapping[tuple[str, str, str], Mapping[str, Paired]]) -> list[Table]:
-    tables = []
-    order = list(dict.fromkeys(_site_of(measure) for found in result.schemes.values() for measure in found))
-    for reference in dict.fromkeys(reference for _, reference, _ in both):
-        compared = [(scheme, measure) for scheme, other, measure in both if other == reference]
-        for name, found_at in _sites_of([measure for _, measure in compared]).items():
-            # The first scheme may be paired on some sites alone.
-            sites = sorted(found_at, key=order.index)
-            for kind in ("difference", "ratio"):
-                rows = [
-                    [
-                        label_of(result, scheme),
-                        *(_pair_cell(both.get((scheme, reference, f"{name}@{site}"), {}).get(kind)) for site in sites),
-                    ]
-                    for scheme in dict.fromkeys(scheme for scheme, _ in compared)
-                ]
-                if all(text == NONE for row in rows for text in row[1:]):
-                    continue
-                caption = f"{_sited_label(result, name, sites[0])}: {kind} to {_reference_label(result, reference)}"
-                tables.append(Table(caption, ["scheme", *sites], rows))
+        tables.append(Table(f"{caption}: ratio to {_label(result, reference)}", ["scheme", *sites], texts))
     return tables
 
 
-def _site_of(measure: str) -> str:
-    """The site in a measure's name, such as ``stress`` in ``events@stress``; empty for a result of one site."""
-    return measure.partition("@")[2]
+def _compared(result: Result) -> str:
+    """The measure whose ratios are shown."""
+    names = [pair.measure for pair in result.paired]
+    return _LOST if _LOST in names or not names else names[0]
 
 
-def _sites_of(measures: Sequence[str]) -> dict[str, list[str]]:
-    """The sites of each measure, both in the order given."""
-    sites: dict[str, list[str]] = {}
-    for measure in dict.fromkeys(measures):
-        name, _, site = measure.partition("@")
-        sites.setdefault(name, []).append(site)
-    return sites
+def _ratios(result: Result, measure: str) -> dict[tuple[str, str], Paired]:
+    return {(p.scheme, p.reference): p for p in result.paired if p.measure == measure and p.kind == "ratio"}
 
 
-def _sited_label(result: Result, name: str, site: str) -> str:
-    return label_of(result, f"{name}@{site}").removesuffix(f", {site}")
+def _references(result: Result, ratios: dict[tuple[str, str], Paired]) -> list[str]:
+    """The references that at least half of the other schemes are compared with."""
+    found = dict.fromkeys(reference for _, reference in ratios)
+    enough = [r for r in found if 2 * sum(other == r for _, other in ratios) >= len(result.schemes) - 1]
+    return enough[:REFERENCES]
 
 
-def _reference_label(result: Result, name: str) -> str:
-    return BOUND_LABEL if name == "bound" else label_of(result, name)
+def _ratio(ratios: dict[tuple[str, str], Paired], name: str, reference: str) -> str:
+    return "1" if name == reference else cell(ratios.get((name, reference)), 2)
+
+
+def _named(result: Result, ratios: dict[tuple[str, str], Paired], name: str) -> list[str]:
+    """The column of ratios to a reference that differs by scheme; none without any ratio."""
+    own = [f"{cell(pair, 2)} to {_label(result, other)}" for (scheme, other), pair in ratios.items() if scheme == name]
+    return ["; ".join(own) or NONE] if ratios else []
+
+
+def _label(result: Result, name: str) -> str:
+    return "the bound" if name == "bound" else result.labels.get(name) or label_of(result, name)
 
 
 def row_label(result: Result, name: str) -> str:
@@ -141,10 +118,6 @@ def row_label(result: Result, name: str) -> str:
 def _digits(found: Sequence[Found]) -> int:
     # A measure of at most 1 is a share or an index.
     return 3 if 0 < max((interval.mean for interval in found if interval), default=0.0) <= 1 else 1
-
-
-def _pair_cell(found: Paired | None) -> str:
-    return cell(found, 2 if found and (found.kind == "ratio" or abs(found.mean) <= 1) else 1)
 
 
 def cell(found: Found, digits: int = 1) -> str:

@@ -26,7 +26,7 @@ EXPERIMENT = Experiment(
             "top_k", "sweep", (*LOSSES, "state_tokens"), "Losses and the state block's tokens over k, mode llm."
         ),
     ),
-    reference="k5",
+    references=("k5",),
     sweep=Sweep(label="sensors kept, k", at={f"k{k}": float(k) for k in _TOP_KS}),
     notes=("Often fewer than k sensors are heard, free and charged; then all of those are offered.",),
 )

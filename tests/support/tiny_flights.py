@@ -57,7 +57,7 @@ def declared(*schemes: Scheme, name: str = "tiny", **changes: Any) -> Experiment
         "schemes": lambda setup: list(schemes) or [local("eof"), local("random")],
         "measures": ("lost_packets", "events", "jain"),
         "figures": (FigureSpec("tiny", "bars", ("lost_packets", "events"), "Losses."),),
-        "reference": "eof",
+        "references": ("eof",),
     }
     return Experiment(name=name, **{**facts, **changes})
 

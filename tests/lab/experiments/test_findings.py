@@ -16,7 +16,7 @@ from lab.experiments.plan import QUICK_STEPS, Experiment, FigureSpec, plan
 from lab.experiments.plots import BOUND_LABEL
 from lab.experiments.result import Result
 from lab.experiments.schemes import BOUND, llm, local
-from lab.experiments.tables import measure_tables
+from lab.experiments.tables import tables_of
 from simulator.sites.site import Site
 from tests.support.tiny_flights import TINY, decided, declared, flown, setup
 
@@ -37,7 +37,7 @@ def result_of(experiment: Experiment, changes: dict[str, Any] | None = None, **s
         flights[flight.key] = flown(
             [decided(0, 0, **(changes or {}))], seed=seed, failures=[1] * 3, overflows=[0] * 3, lost_packets=lost
         )
-    return findings(planned, setup(**setup_changes), "python -m lab experiment tiny", "abc", flights.get, [])
+    return findings(planned, setup(**setup_changes), "python -m lab experiment tiny", flights.get, [])
 
 
 def test_schemes_are_paired_to_the_reference_on_the_seeds_that_both_flew() -> None:
@@ -73,9 +73,9 @@ def test_a_caption_has_seeds_interval_and_command() -> None:
 
 
 def test_decisions_taken_in_the_llms_place_are_not_passed_off_as_its_own() -> None:
-    late = result_of(declared(llm(), reference="llm"), {"reason": "llm_timeout"}, llm=setup().llm.__class__())
+    late = result_of(declared(llm(), references=("llm",)), {"reason": "llm_timeout"}, llm=setup().llm.__class__())
     assert any("2 of 2 decisions are not the LLM's" in note and "llm_timeout" in note for note in late.notes)
-    own = result_of(declared(llm(), reference="llm"), {"source": "llm"}, llm=setup().llm.__class__())
+    own = result_of(declared(llm(), references=("llm",)), {"source": "llm"}, llm=setup().llm.__class__())
     assert not any("not the LLM's" in note for note in own.notes)
 
 
@@ -85,7 +85,7 @@ def test_a_measure_that_some_seed_lacks_is_omitted_with_a_note() -> None:
         p.key: flown([decided(0, 0, failed=p.seed == 1)], seed=p.seed, failures=[0], overflows=[0], lost_packets=[0])
         for p in planned.flights
     }
-    result = findings(planned, setup(), "x", None, flights.get, [])
+    result = findings(planned, setup(), "x", flights.get, [])
     assert "jain" not in result.schemes["eof"]
     assert any("it has none on 1 of 3 seeds" in note for note in result.notes)
 
@@ -102,7 +102,7 @@ def test_the_measures_names_have_the_site() -> None:
 def test_each_site_has_a_bound_and_a_best_heuristic_of_its_own() -> None:
     sites = {"paper": Site(TINY), "stress": Site(TINY.model_copy(update={"name": "stress", "link_share": 0.35}))}
     experiment = declared(
-        local("eof"), local("random"), BOUND, worlds=("stress",), heuristics=("eof", "random"), reference=None
+        local("eof"), local("random"), BOUND, worlds=("stress",), heuristics=("eof", "random"), references=()
     )
     result = result_of(experiment, sites=sites)
     assert result.bound["lost_packets@paper"].values == result.bound["lost_packets@stress"].values == [2, 3, 4]
@@ -112,29 +112,29 @@ def test_each_site_has_a_bound_and_a_best_heuristic_of_its_own() -> None:
     assert found["random", "best_heuristic", "excess@stress", "ratio"] == pytest.approx(171 / 51)
     assert found["random", "bound", "lost_packets@paper", "difference"] == pytest.approx(57.0)
     assert ("eof", "best_heuristic", "lost_packets@paper", "ratio") not in found
-    assert {"experiment": "tiny", "scheme": "bound", "seed": "2", "measure": "lost_packets@stress", "value": "4"} in [
-        *csv.DictReader(StringIO(tidy(result)))
-    ]
+    [*_, least] = csv.DictReader(StringIO(tidy(result)))
+    assert {"scheme": "bound", "seed": "2", "lost_packets@stress": "4", "events@stress": ""}.items() <= least.items()
     assert any("clairvoyant bound@stress: proven optimal on 2 of 3 seeds" in note for note in result.notes)
-    [lost, *_] = measure_tables(result)
+    [lost, *_] = tables_of(result)
     assert lost.rows[-1][0] == BOUND_LABEL and lost.rows[-1][1].startswith("3.0")
 
 
-def test_the_table_has_a_line_a_scheme_seed_and_measure() -> None:
-    result = result_of(declared(local("eof"), BOUND))
+def test_the_table_has_a_line_a_scheme_and_seed() -> None:
+    result = result_of(declared(local("eof"), llm(), BOUND), llm=setup().llm.__class__())
     rows = list(csv.DictReader(StringIO(tidy(result))))
-    assert {"experiment": "tiny", "scheme": "eof", "seed": "1", "measure": "lost_packets", "value": "20"} in rows
-    assert {"experiment": "tiny", "scheme": "bound", "seed": "2", "measure": "lost_packets", "value": "4"} in rows
+    assert [(row["scheme"], row["seed"], row["lost_packets"]) for row in rows] == [
+        ("eof", "0", "10"), ("eof", "1", "20"), ("eof", "2", "30"), ("llm", "0", "20"), ("llm", "1", "40"),
+        ("bound", "0", "2"), ("bound", "1", "3"), ("bound", "2", "4"),
+    ]  # fmt: skip
 
 
-def test_flights_of_two_commits_have_a_note() -> None:
+def test_a_result_names_each_commit_of_its_flights() -> None:
     planned = plan(declared(local("eof")), setup())
     flights = {
         p.key: flown([decided(0, 0)], seed=p.seed, commit=f"c{p.seed}", failures=[0], overflows=[0], lost_packets=[0])
         for p in planned.flights
     }
-    notes = findings(planned, setup(), "x", None, flights.get, []).notes
-    assert any("c0, c1, c2" in note for note in notes)
+    assert findings(planned, setup(), "x", flights.get, []).commit == "c0, c1, c2"
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=list(EXPERIMENTS))
@@ -143,7 +143,7 @@ def test_the_names_that_experiments_declare_exist(experiment: Experiment, pace: 
     names = {scheme.name for scheme in experiment.schemes(setup(pace=pace))}
     whole = {scheme.name for scheme in experiment.schemes(setup())}
     assert names <= whole
-    assert experiment.reference is None or experiment.reference in names
+    assert set(experiment.references) <= names
     assert set(experiment.heuristics) <= names
     assert {name for pair in experiment.pairs for name in pair} <= whole
     assert set(experiment.measures) <= MEASURES.keys() and set(experiment.paired_measures) <= set(experiment.measures)
@@ -174,5 +174,5 @@ def test_a_bound_that_a_scheme_undercuts_is_called_wrong() -> None:
         else flown([decided(0, 0)], failures=[0], overflows=[0], lost_packets=[4])
         for p in planned.flights
     }
-    notes = findings(planned, setup(seeds=1), "x", None, flights.get, []).notes
+    notes = findings(planned, setup(seeds=1), "x", flights.get, []).notes
     assert "The bound is wrong: less than it was lost by EOF, seed 0." in notes

@@ -77,7 +77,7 @@ def test_experiments_share_flights_and_a_second_run_flies_nothing(tmp_path: Path
     run_in(tmp_path).make([declared(name="one")])
     before = flights_in(tmp_path)
     assert len(before) == 6
-    run_in(tmp_path).make([declared(local("random"), local("wqcs"), name="two", reference="random")])
+    run_in(tmp_path).make([declared(local("random"), local("wqcs"), name="two", references=("random",))])
     after = flights_in(tmp_path)
     assert len(after) == 9
     assert before.items() <= after.items()

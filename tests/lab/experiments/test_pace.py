@@ -24,7 +24,7 @@ def test_measured_durations_replace_the_estimate() -> None:
 
 
 def test_an_llms_flight_is_taken_for_a_long_one_before_any_was_flown() -> None:
-    [asking, *_] = plan(declared(llm(), reference="llm"), setup(llm=setup().llm.__class__())).flights
+    [asking, *_] = plan(declared(llm(), references=("llm",)), setup(llm=setup().llm.__class__())).flights
     assert Pace().left_s([asking]) > 10 * Pace().left_s(flights()[:1])
 
 

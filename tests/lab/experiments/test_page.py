@@ -7,13 +7,19 @@ from pathlib import Path
 import pytest
 
 from lab.experiments.catalogue import EXPERIMENTS
+from lab.experiments.findings import tidy
 from lab.experiments.page import (
+    DATA,
+    FIGURES,
     Swap,
     late_and_whole,
     main,
     packets_and_events,
+    render_page,
     results_in,
     seeds_text,
+    shown,
+    stored_in,
     swap,
     write_page,
 )
@@ -21,6 +27,7 @@ from lab.experiments.result import Paired, Result
 from lab.experiments.tables import cell
 from simulator.errors import UsageError
 from tests.support.made_results import CURVES, figure, interval, result, zero_from
+from tests.support.places import ROOT
 
 LATER = datetime(2026, 5, 6, tzinfo=UTC)
 
@@ -71,30 +78,59 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return runs / "docs" / "results.md"
 
 
-def test_an_experiment_with_a_result_has_figures_numbers_and_origin(written: Path) -> None:
-    shown = section(written.read_text(), "scheduler")
+def test_an_experiment_with_a_result_has_its_origin_data_figure_and_numbers(written: Path) -> None:
+    text = section(written.read_text(), "scheduler")
     for part in (
-        "python -m lab experiment scheduler --llm none", "0 to 29 (30)",
-        "tiny.gguf", "A note of the run.", "![The scheduler experiment](figures/scheduler/losses.svg)",
-        "| AIC-VDS, mode llm (10 seeds) † | 12.0 | 5.0 |", "| EOF | 176 | – |",
-        "| clairvoyant bound (proven) | 0.8 | – |",
-        "| AIC-VDS, mode llm (10 seeds) | EOF | lost packets | – | 0.07 [0.05, 0.09] |",
-        "| clairvoyant bound (proven) | lost packets | 11.0 [9.0, 13.0] | – |",
+        "```sh\npython -m lab experiment scheduler --llm none\n```", "seeds 0 to 29 (30), LLM tiny.gguf",
+        "Commit 0123456789abcdef:", "[CSV](data/experiments/scheduler.csv)", "A note of the run.",
+        "![What it shows.](figures/scheduler/totals.svg)",
+        "| scheme | lost packets | loss events | to EOF |",
+        "| AIC-VDS, mode llm (10 seeds) † | 12.0 | 5.0 | 0.07 [0.05, 0.09] |", "| EOF | 176 | – | 1 |",
+        "| clairvoyant bound (proven) | 0.8 | – | – |",
     ):  # fmt: skip
-        assert part in shown, part
-    assert "commit" not in shown and "2026-01-02" not in shown
+        assert part in text, part
+    assert "2026-01-02" not in text
+    assert (written.parent / "data/experiments/scheduler.csv").read_text().startswith("scheme,seed,lost_packets,events")
 
 
-def test_the_figures_that_it_shows_are_there_and_no_others(written: Path) -> None:
-    shown = {written.parent / path for path in re.findall(r"\]\((figures/[^)]+)\)", written.read_text())}
-    assert len(shown) == 2
-    assert set((written.parent / "figures").rglob("*.*")) == shown
-    assert all(path.read_text().endswith("</svg>\n") for path in shown)
+def test_the_figure_that_it_shows_is_there_and_no_other(written: Path) -> None:
+    linked = {written.parent / path for path in re.findall(r"\]\((figures/[^)]+)\)", written.read_text())}
+    assert len(linked) == 1
+    assert set((written.parent / "figures").rglob("*.*")) == linked
+    assert all(path.read_text().endswith("</svg>\n") for path in linked)
 
 
-def test_an_experiment_without_a_result_has_the_command_to_run_it(written: Path) -> None:
-    for name in EXPERIMENTS.keys() - {"scheduler"}:
-        assert f"Not run. `python -m lab experiment {name}` makes it." in section(written.read_text(), name)
+def test_experiments_without_a_result_are_named(written: Path) -> None:
+    listed = section(written.read_text(), "Not flown")
+    assert set(re.findall(r"`([a-z-]+)`", listed)) == EXPERIMENTS.keys() - {"scheduler"}
+
+
+def test_the_page_is_made_again_from_its_data_alone(written: Path) -> None:
+    before = {path: path.read_bytes() for path in written.parent.rglob("*") if path.is_file()}
+    write_page(None, written)
+    assert {path: path.read_bytes() for path in written.parent.rglob("*") if path.is_file()} == before
+
+
+def test_a_later_run_replaces_an_experiments_data_and_a_quick_one_does_not(tmp_path: Path) -> None:
+    out = tmp_path / "docs" / "results.md"
+    write_page(stored(tmp_path / "first", scheduler()), out)
+    later = scheduler().model_copy(update={"created_at": LATER, "figures": []})
+    for made, commit in (({"quick": True, "commit": "c"}, "0123456789abcdef"), ({"commit": "d"}, "d")):
+        write_page(stored(tmp_path / commit, later.model_copy(update=made)), out)
+        assert stored_in(out.parent / DATA)["scheduler"].commit == commit
+
+
+def test_the_page_that_ships_is_made_from_the_data_that_ships() -> None:
+    """Nobody writes a number or a verdict by hand."""
+    page, found = ROOT / "docs/results/experiments.md", stored_in(ROOT / "docs/results" / DATA)
+    figures = page.parent / FIGURES
+    drawn = {name: [(one, figures / name / f"{one.name}.svg") for one in shown(r)] for name, r in found.items()}
+    assert all(path.is_file() for pictures in drawn.values() for _, path in pictures)
+    assert render_page(found, drawn, page.parent) == page.read_text(encoding="utf-8")
+    for name, made in found.items():
+        assert made.commit and "dirty" not in made.commit and not made.quick
+        assert (page.parent / DATA / f"{name}.csv").read_text(encoding="utf-8") == tidy(made)
+    assert len(page.read_text(encoding="utf-8").splitlines()) <= 400
 
 
 def test_the_papers_statements_have_our_numbers_and_a_verdict_each(written: Path) -> None:
@@ -107,7 +143,7 @@ def test_the_papers_statements_have_our_numbers_and_a_verdict_each(written: Path
 
 
 def test_the_statements_are_judged_again_for_the_llm_with_its_adapter(written: Path, tmp_path: Path) -> None:
-    heading = "The same statements, of the LLM with its adapter"
+    heading = "with the LLM with its adapter (tiny.gguf)"
     assert heading not in written.read_text()
     adapted = result("adapter-claims", {"llm": {"lost_packets": 42.0}}, curves={"llm": zero_from(30)})
     text = page(stored(tmp_path, scheduler(), adapted))
@@ -119,7 +155,7 @@ def test_a_quick_run_is_marked_and_gets_no_verdict(tmp_path: Path) -> None:
     text = page(stored(tmp_path, scheduler().model_copy(update={"quick": True, "figures": []})))
     assert "**quick run**" in section(text, "scheduler")
     assert not re.search(r"\*\*(reproduced|not reproduced|not comparable)\*\*", text)
-    assert "0 are reproduced" in text
+    assert "Not judged: no LLM has flown" in text
 
 
 def test_a_full_run_counts_before_a_quick_one_and_the_latest_of_full_ones(tmp_path: Path) -> None:
@@ -142,7 +178,7 @@ def test_the_meaning_of_098_follows_from_measured_values(tmp_path: Path) -> None
     assert "never choose the same sensor, as here, E[X] = J - 3 and chance gives **0.929**" in text
     assert "a random fleet's have 0.933 here" in text
     assert "| EOF | 0.855 | 0.890 | 176 |" in text
-    assert "the most even is round robin (0.899, 465 packets lost)" in text
+    assert "the most even scheme is round robin (0.899, 465 packets lost)" in text
     assert "EOF (176), whose index is 0.855" in text
 
 
@@ -176,7 +212,7 @@ def test_means_of_fewer_worlds_are_not_put_beside_the_others(tmp_path: Path) -> 
     assert list(late_and_whole(made)) == []
     assert "guided" not in packets_and_events(made) and "EOF" in packets_and_events(made)
     text = " ".join(page(stored(tmp_path, made)).split())
-    assert "the most even is EOF (0.800, 30.0 packets lost); the fewest packets are lost by EOF (30.0)" in text
+    assert "the most even scheme is EOF (0.800, 30.0 packets lost); the fewest packets are lost by EOF (30.0)" in text
 
 
 def test_schemes_with_equal_ranks_do_not_swap() -> None:
@@ -187,6 +223,8 @@ def test_schemes_with_equal_ranks_do_not_swap() -> None:
 def test_a_folder_without_results_or_with_a_broken_one_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"has no results\.json; make some with: python -m lab experiment all --out"):
         write_page(tmp_path, tmp_path / "results.md")
+    with pytest.raises(UsageError, match=r"has no results; take some in with --runs DIR"):
+        write_page(None, tmp_path / "results.md")
     broken = tmp_path / "tokens" / "results.json"
     broken.parent.mkdir()
     broken.write_text('{"experiment": "tokens"}')
@@ -195,7 +233,7 @@ def test_a_folder_without_results_or_with_a_broken_one_is_refused(tmp_path: Path
 
 
 def test_an_experiment_that_the_catalogue_lacks_is_shown_too(tmp_path: Path) -> None:
-    assert "Not run" not in section(page(stored(tmp_path, result("training", {"madqn": {"return": 3.0}}))), "training")
+    assert "3.0" in section(page(stored(tmp_path, result("training", {"madqn": {"return": 3.0}}))), "training")
 
 
 def test_numbers_have_as_many_digits_as_their_precision_allows() -> None:
