@@ -24,6 +24,7 @@ from lab.marl.training import Round
 from shared.world.scenario import Scenario
 
 # The paper's table.
+DISCOUNT = 0.99
 LEARNING_RATE = 3e-4
 CLIP = 0.2
 ENTROPY = 0.01
@@ -34,7 +35,6 @@ EPISODES = 21_600
 WORLDS = 40
 DECAY_ROUNDS = 40
 MINIBATCHES = 4
-DISCOUNT = 0.99
 LAMBDA = 0.9
 REWARD_SCALE = 0.1
 GRADIENT_NORM = 0.5
