@@ -35,8 +35,8 @@ EXPERIMENT = Experiment(
     ),
     paired_measures=(*LOSSES, "state_tokens", "prompt_tokens"),
     notes=(
-        "Random start: attention and velocity modules untrained, as in the paper; else from the checkpoint that ships. "
-        "Without attention every admissible sensor stands in the prompt, in the request's order.",
+        "Random start: attention and velocity modules untrained, as the paper's algorithm suggests; else from the "
+        "checkpoint that ships. Without attention every admissible sensor is in the prompt, in the request's order.",
         "A paired difference whose interval holds 0 is no proof that there is none: read its width.",
     ),
 )

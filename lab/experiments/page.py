@@ -160,7 +160,7 @@ def render_page(results: Mapping[str, Result], drawn: Mapping[str, Sequence[tupl
     return environment.get_template("results.md.j2").render(
         judged={llm: found for llm, found in judged.items() if any(f.verdict and f.model for f in found)},
         verdicts=list(claims.Verdict),
-        common=[note for note, times in often.items() if times > 1],
+        common=[note for note, times in often.items() if 2 * times > len(results) > 1],
         experiments=[*EXPERIMENTS, *sorted(results.keys() - set(EXPERIMENTS))],
         missing=[name for name in EXPERIMENTS if name not in results],
         results=results,
