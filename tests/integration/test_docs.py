@@ -6,11 +6,13 @@ import os
 import re
 import subprocess
 import sys
+import unicodedata
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from tests.conftest import Edge
 from tests.support.places import ROOT
@@ -109,6 +111,18 @@ def test_no_page_has_a_commit_or_a_day(page: Path) -> None:
     # A command makes this page, and its results name the commit that flew them.
     commits = [] if page == DOCS / "results" / "experiments.md" else COMMIT.findall(text)
     assert commits + DAY.findall(text) == []
+
+
+def test_the_citation_names_the_paper_and_the_software_as_the_docs_do() -> None:
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert cited.keys() >= {"cff-version", "message", "title", "authors", "type", "license"}
+    paper, page = cited["preferred-citation"], (DOCS / "results" / "paper.md").read_text(encoding="utf-8")
+    bibtex = re.search(r"```bibtex\n(.*?)```", page, re.DOTALL)
+    assert bibtex
+    plain = re.sub(r"\{\\'(\w)\}", lambda accent: unicodedata.normalize("NFC", accent[1] + "\u0301"), bibtex[1])
+    assert paper["title"] in plain.replace("{AIC-VDS}", "AIC-VDS")
+    names = [f"{author['family-names']}, {author['given-names']}" for author in paper["authors"]]
+    assert f"{{{' and '.join(names)}}}" in plain and f"{{{paper['doi']}}}" in plain and f"{{{paper['year']}}}" in plain
 
 
 def lines(pages: Iterable[Path]) -> int:
