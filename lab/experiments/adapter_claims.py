@@ -21,7 +21,7 @@ def _schemes(setup: Setup) -> list[Scheme]:
         *(_adapted(f"k{k}", f"k = {k}", top_k=k) for k in _OTHER_KS),
         _adapted("llm_all", "no attention", attention="off"),
         over_edge("llm_chance", "uniform draws in place of an LLM", backing=CHANCE),
-        *available_locals("madqn", "eof", "wqcs", "random"),
+        *available_locals("eof", "wqcs", "madqn_paper", "mappo", "random"),
     ]
 
 

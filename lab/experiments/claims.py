@@ -35,6 +35,8 @@ OURS_ZERO_AT, HEURISTICS_ZERO_AT, MADQN_ZERO_AT = 4, 20, 27
 TOKENS_WITHOUT, TOKENS_WITH = 213.7, 106.8
 JAIN = 0.980
 NEAR_JAIN, NEAR_SAVED_POINTS = 0.01, 5.0
+# The paper's baselines; its MAPPO on the plain state was not trained, and ours sees more.
+RIVALS = ("eof", "wqcs", "madqn_paper", "mappo")
 LOSSES = {"lost_packets_per_step": "lost packets", "events_per_step": "loss events"}
 
 
@@ -193,7 +195,7 @@ def _settling(means: Sequence[float]) -> str:
 
 
 def _loses_least(result: Result, runs: Runs) -> Judged:
-    rivals = {name: measured(result, name, "lost_packets") for name in ("eof", "wqcs", "madqn")}
+    rivals = {name: measured(result, name, "lost_packets") for name in RIVALS}
     apart = {name: difference(result, METHOD, name, "lost_packets") for name, found in rivals.items() if found}
     missing = [name for name, found in rivals.items() if not found]
     won = all(d.high < 0 for d in apart.values())
@@ -329,9 +331,11 @@ CLAIMS: tuple[Claim, ...] = (
         _zero_by("wqcs", HEURISTICS_ZERO_AT, NEAR_STEPS),
     ),
     Claim(
-        f"MADQN reaches zero only by step {MADQN_ZERO_AT}", "scheduler", _zero_by("madqn", MADQN_ZERO_AT, NEAR_STEPS)
+        f"MADQN reaches zero only by step {MADQN_ZERO_AT}",
+        "scheduler",
+        _zero_by("madqn_paper", MADQN_ZERO_AT, NEAR_STEPS),
     ),
-    Claim("so AIC-VDS loses less than EOF, WQCS and MADQN", "scheduler", _loses_least),
+    Claim("AIC-VDS loses less than EOF, WQCS, MADQN and MAPPO", "scheduler", _loses_least),
     Claim(
         "attention halves the prompt",
         "tokens",

@@ -63,10 +63,10 @@ def fair(served: float, scheduled: float) -> Result:
         ("EOF reaches zero", flown(eof=3), NOT),
         ("WQCS reaches zero", flown(wqcs=24), REPRODUCED),
         ("WQCS reaches zero", flown(wqcs=25), NOT),
-        ("MADQN reaches zero", flown(madqn=27), REPRODUCED),
-        ("MADQN reaches zero", flown(madqn=10), NOT),
-        ("loses less than EOF", flown(llm=4, eof=20, wqcs=20, madqn=27), REPRODUCED),
-        ("loses less than EOF", flown(llm=24, eof=20, wqcs=28, madqn=29), NOT),
+        ("MADQN reaches zero", flown(madqn_paper=27), REPRODUCED),
+        ("MADQN reaches zero", flown(madqn_paper=10), NOT),
+        ("loses less than EOF", flown(llm=4, eof=20, wqcs=20, madqn_paper=27, mappo=9), REPRODUCED),
+        ("loses less than EOF", flown(llm=24, eof=20, wqcs=28, madqn_paper=29, mappo=30), NOT),
         ("halves the prompt", tokens(50.0, 70.0), REPRODUCED),
         ("halves the prompt", tokens(25.0, 50.0), NOT),
         ("only the state block", tokens(25.0, 50.0), REPRODUCED),
@@ -132,13 +132,25 @@ def test_only_full_runs_in_the_papers_world_are_judged(
 
 def test_claims_without_a_run_or_a_measurement_have_no_verdict() -> None:
     assert all((f.verdict, f.why) == (None, "not run") for f in judge({}))
-    assert finding("MADQN reaches zero", flown(eof=20)).why == "not measured: lost_packets_per_step of madqn"
-    assert finding("loses less than EOF", flown(llm=4, eof=20)).why == "not measured: lost_packets of wqcs, madqn"
+    assert finding("MADQN reaches zero", flown(eof=20)).why == "not measured: lost_packets_per_step of madqn_paper"
+    assert (
+        finding("loses less than EOF", flown(llm=4, eof=20)).why
+        == "not measured: lost_packets of wqcs, madqn_paper, mappo"
+    )
     assert finding("loses less than EOF", flown(llm=24, eof=20)).verdict is NOT
 
 
 def test_one_experiment_answers_every_claim_for_the_llm_with_its_adapter() -> None:
-    lost = {"llm": 42.0, "k3": 80.0, "llm_all": 42.0, "llm_chance": 380.0, "eof": 176.0, "wqcs": 228.0, "madqn": 138.0}
+    lost = {
+        "llm": 42.0,
+        "k3": 80.0,
+        "llm_all": 42.0,
+        "llm_chance": 380.0,
+        "eof": 176.0,
+        "wqcs": 228.0,
+        "madqn_paper": 352.0,
+        "mappo": 81.0,
+    }
     made = result(
         WITH_ADAPTER,
         {name: {"lost_packets": value} for name, value in lost.items()},
@@ -148,7 +160,7 @@ def test_one_experiment_answers_every_claim_for_the_llm_with_its_adapter() -> No
     found = {finding.stated: finding for finding in judge_with_adapter({WITH_ADAPTER: made})}
     assert {finding.experiment for finding in found.values()} == {WITH_ADAPTER}
     assert found["AIC-VDS loses nothing from step 4"].verdict is REPRODUCED
-    assert found["so AIC-VDS loses less than EOF, WQCS and MADQN"].verdict is REPRODUCED
+    assert found["AIC-VDS loses less than EOF, WQCS, MADQN and MAPPO"].verdict is REPRODUCED
     assert found["k=3 is worse than k=5"].verdict is REPRODUCED
     assert found["EOF reaches zero only by step 20"].verdict is None
     assert judge_with_adapter({}) == []
