@@ -42,7 +42,7 @@ class Fly:
     Each UAV flies the mission that you uploaded to its autopilot, and this program sets its speed: at every waypoint of
     the world (each step_s seconds) it reads the position, hears the sensors' beacons, asks the edge which sensor to
     collect from and how fast to fly, and reports the outcome. At 0 m/s the UAV holds, then goes on with its
-    mission. While the edge is silent the UAV collects from the longest queue in reach.
+    mission. While the edge is silent the UAV collects from the longest queue in reach, at its last velocity.
 
     It never arms, takes off, lands or sends a position: the path is the uploaded mission, and failsafes are the
     autopilot's. A UAV that a pilot or a failsafe flies, or that is off its path or outside the world's fence, gets no

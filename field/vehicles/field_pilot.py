@@ -11,8 +11,7 @@ from shared.wire.missions import MissionStatus
 from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
-from simulator.flying.pilots import FALLBACK, PilotChoice, reason_on_board
-from simulator.policies.registry import policy_named
+from simulator.flying.pilots import OnBoard, PilotChoice, reason_on_board
 from simulator.world.observation import Observation
 from simulator.world.observation_report import decide_request
 
@@ -50,8 +49,7 @@ class FieldPilot:
         self.last_error: str | None = None
         self._client, self._mission_id, self._scenario = client, mission_id, scenario
         self._patience_s, self._deadline_ms = patience_s, deadline_ms
-        self._fallback = policy_named(FALLBACK)
-        self._fallback.reset(scenario, 0)
+        self._on_board = OnBoard(scenario, 0)
         self._pending_outcomes: dict[int, Outcome] = {}
         # Outcomes sent to an edge that could not write them to disk; they are sent again at the end.
         self._unstored_outcomes: list[Outcome] = []
@@ -97,8 +95,7 @@ class FieldPilot:
         for (uav, seen), found in zip(observations.items(), answers, strict=True):
             if not isinstance(found, PilotChoice):
                 taken = frozenset(choice.sensor for choice in choices.values())
-                sensor, velocity = self._fallback.decide(uav, seen, taken)
-                choices[uav] = PilotChoice(int(sensor), int(velocity), "onboard", found)
+                choices[uav] = self._on_board.decide(uav, seen, taken, found)
         return dict(sorted(choices.items()))
 
     def learn(self, uav: int, choice: PilotChoice, cost: float, failed: bool) -> None:
@@ -131,6 +128,7 @@ class FieldPilot:
             self._joined = False
             return reason_on_board(error if isinstance(error, EdgeError) else EdgeUnreachable(self.last_error))
         answer = exchange.response
+        self._on_board.follow(uav, answer.velocity)
         if outcome is not None and self._pending_outcomes.pop(uav, None) is not None and not answer.stored:
             self._unstored_outcomes.append(outcome)
         return PilotChoice(answer.sensor_id, answer.velocity, answer.source, answer.reason, exchange)

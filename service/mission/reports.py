@@ -142,18 +142,19 @@ class Reports:
         Either all places are within 2 m of each other, or a UAV's first position has parts of a millimetre and is off
         its trajectory.
         """
-        places = [tuple(report.position), *zip(report.sensors.x or (), report.sensors.y or (), strict=True)]
-        if any(abs(x) > 180 or abs(y) > 90 for x, y in places[:1]):
+        x, y = report.position
+        if abs(x) > 180 or abs(y) > 90:
             return
+        places = [(x, y), *zip(report.sensors.x or (), report.sensors.y or (), strict=True)]
         lowest, highest = np.min(places, axis=0), np.max(places, axis=0)
         if len(set(places)) < 3 or (highest - lowest).max() >= _DEGREES_APART:
             path = trajectories(self._scenario)[report.uav_id]
-            exact = all(round(value, 3) != value for value in report.position)
-            if report.uav_id in self._belief.uavs or not exact or progress_of(path, report.position) is not None:
+            exact = round(x, 3) != x and round(y, 3) != y
+            if report.uav_id in self._belief.uavs or not exact or progress_of(path, (x, y)) is not None:
                 return
         raise Refused(
             f"{at}position",
-            f"{report.position[0]:g}, {report.position[1]:g} looks like degrees: the mission's world is in metres from "
+            f"{x:g}, {y:g} looks like degrees: the mission's world is in metres from "
             "its corner, x to the east and y to the north. Metres that are meant are sent in whole millimetres",
         )
 

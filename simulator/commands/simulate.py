@@ -56,8 +56,8 @@ class Simulate(WorldOptions):
 
       aicvds simulate --policy fullest.py:FullestInRange --against edge:value --against mpc --sensors 20 --uavs 5
 
-    If the edge is lost during the flight, the UAVs collect from the longest queue in reach, and before the next step
-    wait up to --reconnect-s seconds for the edge to come back. Steps are not real time, so without this pause the
+    If the edge is lost during the flight, the UAVs collect from the longest queue in reach at their last velocities, and
+    before the next step wait up to --reconnect-s seconds for the edge to come back. Steps are not real time, so without this pause the
     mission would end first.
 
     Ctrl-C stops the flight and still writes the report of the steps flown. The environment variable AICVDS_API_KEY has

@@ -67,13 +67,34 @@ class LocalPilot:
         """Do nothing: no outcome is pending."""
 
 
+class OnBoard:
+    """Decides while no edge answers: the longest queue in reach, at the velocity that the edge decided last for a UAV.
+
+    A planned fleet waits where its sensors are; a velocity of its own would carry a UAV past them, a lap away.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        self._policy: Policy = policy_named(FALLBACK)
+        self._policy.reset(scenario, seed)
+        self._velocities: dict[int, int] = {}
+
+    def follow(self, uav: int, velocity: int) -> None:
+        """Remember a velocity that the edge has decided."""
+        self._velocities[uav] = velocity
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int], reason: str) -> PilotChoice:
+        """The choice, with the reason why it is not the edge's."""
+        sensor, velocity = self._policy.decide(uav, observation, taken)
+        return PilotChoice(int(sensor), self._velocities.get(uav, int(velocity)), "onboard", reason)
+
+
 class EdgePilot:
-    """The pilot that asks an edge; without a usable answer the UAV collects from the longest queue in reach.
+    """The pilot that asks an edge; without a usable answer the UAV decides on board.
 
     ``spec`` is the mission to create at the edge before the first decision. ``on_request`` is called with each request
-    before it is sent. ``answered`` counts the edge's decisions, and ``last_error`` is the text of the last failure.
-    After a step with an unreachable edge the fleet waits until the client ``probe`` finds it ready, at most
-    ``reconnect_s`` seconds in all per outage.
+    before it is sent. ``answered`` counts the edge's decisions, ``on_board`` decides without it, and ``last_error`` is
+    the text of the last failure. After a step with an unreachable edge the fleet waits until the client ``probe`` finds
+    it ready, at most ``reconnect_s`` seconds in all per outage.
     """
 
     def __init__(
@@ -103,8 +124,7 @@ class EdgePilot:
         # Outcomes sent to an edge that could not write them to disk; they are sent again at the end.
         self._unstored_outcomes: list[Outcome] = []
         self._lost = False
-        self._fallback: Policy = policy_named(FALLBACK)
-        self._fallback.reset(scenario, seed)
+        self.on_board = OnBoard(scenario, seed)
         self.on_request: Callable[[DecideRequest], None] = lambda request: None
         self.answered = 0
         self.last_error: str | None = None
@@ -123,13 +143,13 @@ class EdgePilot:
             exchange = self._ask(request)
         except EdgeError as error:
             self.last_error = str(error)
-            sensor, velocity = self._fallback.decide(uav, observation, taken)
-            return PilotChoice(int(sensor), int(velocity), "onboard", reason_on_board(error))
+            return self.on_board.decide(uav, observation, taken, reason_on_board(error))
         self._pending_outcomes.pop(uav, None)
         if request.outcome is not None and not exchange.response.stored:
             self._unstored_outcomes.append(request.outcome)
         self.answered += 1
         answer = exchange.response
+        self.on_board.follow(uav, answer.velocity)
         return PilotChoice(answer.sensor_id, answer.velocity, answer.source, answer.reason, exchange)
 
     def _await_edge(self) -> None:

@@ -50,6 +50,7 @@ class EdgeStub:
     otherwise: Behaviour = "ok"
     readiness: list[tuple[bool, LLM]] = field(default_factory=lambda: [(True, "ready")])
     model: str = "stub-1"
+    velocity: int = 7
     owner: str | None = None
     gate: Gate = field(default_factory=Gate)
     request_count: int = 0
@@ -103,7 +104,7 @@ class EdgeStub:
             uav_id=body.uav_id,
             step=body.step,
             sensor_id=sensor,
-            velocity=7,
+            velocity=self.velocity,
             source="llm" if body.step else "policy",
             reason=None if body.step else "llm_timeout",
             model=self.model,

@@ -97,7 +97,7 @@ def test_an_edge_that_comes_back_in_time_rejoins() -> None:
         ExitStack() as second,
         EdgeClient(f"http://127.0.0.1:{port}", timeout_s=PATIENCE_S) as client,
     ):
-        first.enter_context(stub_edge_at(port))
+        first.enter_context(stub_edge_at(port)).velocity = 3
         again: list[EdgeStub] = []
         waits: list[str] = []
 
@@ -114,6 +114,8 @@ def test_an_edge_that_comes_back_in_time_rejoins() -> None:
         flight = fly(Site(SHORT), pilot, 9, on_step=goes_away)
         assert [d.source == "onboard" for d in flight.decisions] == [False] * 3 + [True] * 3 + [False] * 6
         assert waits and again[0].missions["m"] == pilot.spec
+        velocities = [[d.velocity for d in flight.decisions if d.uav_id == uav] for uav in range(3)]
+        assert [flown[:2] for flown in velocities] == [[3, 3]] * 3, "on board it keeps the edge's last velocity"
 
 
 def test_an_edge_that_stays_away_costs_one_pause() -> None:
