@@ -82,6 +82,7 @@ async def run_field_mission(job: FieldJob) -> RealFlight:
                 ]
                 client = await stack.enter_async_context(edge_client(job))
                 pilot = FieldPilot(client, job.mission_id, job.site.scenario, job.patience_s, job.mode, job.deadline_ms)
+                pilot.spec = job.site.named(pilot.spec)
                 await join_mission(pilot, job)
                 logs = stack.enter_context(open_logs(job, pilot))
                 await wait_for_missions(uavs, job.wait_s, lambda uav, why: print_line(f"waiting for UAV {uav}: {why}"))

@@ -9,7 +9,8 @@ from typing import Literal
 
 from pydantic import Field, ValidationError
 
-from shared.wire.schemas import DecideRequest, SensorId, Wire
+from shared.wire.schemas import DecideRequest, SensorId
+from shared.wire.strict_models import Wire
 from shared.world.scenario import Scenario
 
 

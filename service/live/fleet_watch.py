@@ -25,6 +25,15 @@ _ENDED_S, _SILENT_S = 600.0, 30.0
 
 
 @dataclass(slots=True)
+class UavReport:
+    """A UAV's newest report: its monotonic time, s, and the newest percent of its battery and height, if reported."""
+
+    at: float
+    battery: float | None = None
+    height_m: float | None = None
+
+
+@dataclass(slots=True)
 class Watched:
     """Observations of one mission since the edge started.
 
@@ -33,11 +42,31 @@ class Watched:
             decision of the step. Sensors of which nothing was ever heard do not count.
         silent: by sensor, the newest step in which a UAV was within its radio radius and did not hear it.
         decided_at: the monotonic time of the last decision, seconds; None before the first.
+        uavs: the newest report of each UAV.
+        began: the newest step, and the monotonic time of its first report.
+        step_took_s: seconds between the first reports of the newest two consecutive steps; None before them.
     """
 
     full: BoundedDict[int, float] = field(default_factory=lambda: BoundedDict(_MOST_STEPS))
     silent: dict[int, int] = field(default_factory=dict)
     decided_at: float | None = None
+    uavs: dict[int, UavReport] = field(default_factory=dict)
+    began: tuple[int, float] = (-2, 0.0)
+    step_took_s: float | None = None
+
+    def take(self, uav: UavState, step: int) -> None:
+        """Take a report's time, and what it says of the UAV itself."""
+        now, known = time.monotonic(), self.uavs.get(uav.uav_id, UavReport(0.0))
+        battery = known.battery if uav.battery_percent is None else uav.battery_percent
+        self.uavs[uav.uav_id] = UavReport(now, battery, known.height_m if uav.height_m is None else uav.height_m)
+        if step > self.began[0]:
+            self.step_took_s = round(now - self.began[1], 3) if step == self.began[0] + 1 else self.step_took_s
+            self.began = step, now
+
+    @property
+    def batteries(self) -> dict[int, float]:
+        """By UAV, percent of its own battery, where that was reported."""
+        return {uav: one.battery for uav, one in self.uavs.items() if one.battery is not None}
 
     def totals(self) -> dict[str, Any]:
         """The page's numbers: sums over the steps, the silent sensors, and the seconds since the last decision."""
@@ -58,6 +87,7 @@ class FleetWatch:
         """Record an answered report, and the belief after it."""
         watched = self.of(mission.mission_id)
         watched.decided_at = time.monotonic()
+        watched.take(uav, step)
         if step not in watched.full:
             watched.full[step] = round(float(_overflowed(mission.belief, step, mission.scenario).sum()), 3)
         self._hear(watched, mission, uav, step)
@@ -78,7 +108,8 @@ class FleetWatch:
             idle_s = _ENDED_S if decided_at is None else time.monotonic() - decided_at
             if idle_s >= _ENDED_S or (mission.belief.newest or 0) >= scenario.steps - 1:
                 continue
-            counts.update({kind: len(found) for kind, found in alarms(mission, mission.deadlines()).items()})
+            batteries = {} if watched is None else watched.batteries
+            counts.update({kind: len(found) for kind, found in alarms(mission, mission.deadlines(), batteries).items()})
             if idle_s > max(_SILENT_S, 3 * scenario.step_s):
                 counts["uav_lost"] += len(mission.belief.uavs)
         return counts

@@ -1,5 +1,6 @@
 """The page's JSON of a mission: a snapshot, or the changes since the last update."""
 
+import time
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,9 @@ def snapshot(mission: Mission, decisions: list[RecentDecision], watched: Watched
             "scenario": scenario.model_dump(include=_SHOWN),
             "pipeline": scenario.pipeline if scenario.layout != "uniform" else (),
             "trajectories": _curves(scenario),
-            "places": np.round(mission.belief.places, 1).tolist(),
+            "places": _places(mission),
+            "names": mission.spec.names,
+            "map": mission.spec.map or (),
             "decisions": [decision.summary() for decision in decisions],
             "outcomes": [],
             "full_by_step": list(watched.full.items()),
@@ -92,7 +95,7 @@ def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
         "learner_loss": mission.learner.last_loss,
         "guidance": _guidance(mission),
         "deadlines": {"met": sum(one.met for one in orders), "missed": sum(one.missed for one in orders)},
-        "alarms": alarms(mission, orders),
+        "alarms": alarms(mission, orders, watched.batteries),
         **watched.totals(),
         "queue": np.round(queue, 1).tolist(),
         "urgency": np.round(urgency(queue, rate, scenario), 3).tolist(),
@@ -106,8 +109,34 @@ def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
             for sensor, excess in belief.channel.radio_map.measured_db().items()
             if excess >= _WORSE_DB
         },
-        "uavs": {uav: {"step": last.step, "position": last.position} for uav, last in belief.uavs.items()},
+        "step_took_s": watched.step_took_s,
+        "uavs": {uav: _uav(mission, watched, uav) for uav in belief.uavs},
     }
+
+
+def _uav(mission: Mission, watched: Watched, uav: int) -> dict[str, Any]:
+    """A UAV's newest report, and where its decision brings it by the next waypoint."""
+    belief, report = mission.belief, watched.uavs.get(uav)
+    last = belief.uavs[uav]
+    goal = None
+    if last.action is not None:
+        goal = last.ahead(belief.trajectory(uav), belief.drift, [last.action[1] * mission.scenario.step_s])[0]
+    return {
+        "step": last.step,
+        "position": last.position,
+        "next": None if goal is None else np.round(goal, 1).tolist(),
+        "battery": report and report.battery,
+        "height_m": report and report.height_m,
+        "heard_s": None if report is None else round(time.monotonic() - report.at, 1),
+    }
+
+
+def _places(mission: Mission) -> list[Any]:
+    """The sensors' positions, of a surveyed world before the first report too."""
+    places, sites = mission.belief.places, mission.scenario.sites
+    if mission.scenario.layout == "surveyed":
+        places = np.where(np.isnan(places), np.array(sites), places)
+    return np.round(places, 1).tolist()  # type: ignore[no-any-return]
 
 
 def _guidance(mission: Mission) -> dict[str, Any]:

@@ -36,6 +36,7 @@ def status_of(mission: Mission) -> MissionStatus:
         learned=learned_world(mission.belief),
         deadlines=mission.deadlines() or None,
         readings=mission.readings.merged or None,
+        names=mission.spec.names,
     )
 
 

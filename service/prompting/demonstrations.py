@@ -14,7 +14,8 @@ import numpy as np
 from service.learning.modules import Weights, top_k
 from service.prompting.rows import Cells, cells
 from shared.features.augmented_state import State, augment
-from shared.wire.schemas import Features, MissionSpec, SensorId, Step, UavState, Wire
+from shared.wire.schemas import Features, MissionSpec, SensorId, Step, UavState
+from shared.wire.strict_models import Wire
 from shared.world.scenario import Scenario
 
 PACKAGED = "demonstrations.json"

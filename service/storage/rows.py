@@ -26,8 +26,9 @@ from shared.wire.schemas import Outcome, SensorColumns, UavState
 PACK_BYTES = 4096
 # The extension type of an array.
 _ARRAY = 1
-# A request's outcome is a separate event, and its encoding is not stored. `encode` adds the sensors.
-_REPORT = set(UavState.model_fields) - {"outcome", "base", "uplink", "sensors"}
+# A request's outcome is a separate event; its encoding and what only the page shows is not stored. `encode` adds the
+# sensors.
+_REPORT = set(UavState.model_fields) - {"outcome", "base", "uplink", "sensors", "battery_percent", "height_m"}
 # The fields of an outcome that change a mission's state.
 _OUTCOME = set(Outcome.model_fields) - {"round_trip_ms"}
 

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
-from shared.wire.schemas import MissionId, Note, Received, SensorId, Wire
+from shared.wire.schemas import MissionId, Note, SensorId
+from shared.wire.strict_models import Received, Wire
 from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario
 

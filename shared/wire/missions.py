@@ -4,7 +4,9 @@ from typing import Literal
 
 from pydantic import ConfigDict, Field
 
-from shared.wire.schemas import Belief, DecisionId, Features, Init, MissionId, Mode, PromptStyle, Wire
+from shared.wire.names import Names
+from shared.wire.schemas import Belief, DecisionId, Features, Init, MissionId, Mode, PromptStyle
+from shared.wire.strict_models import Wire
 from shared.world.scenario import Scenario
 
 
@@ -79,6 +81,11 @@ class MissionStatus(Wire):
         None,
         exclude_if=lambda value: value is None,
         description="sensors' own readings that changed the belief; omitted where there was none",
+    )
+    names: Names | None = Field(
+        None,
+        exclude_if=lambda value: value is None,
+        description="the user's names of sensors and UAVs; omitted where none were given",
     )
 
 

@@ -4,7 +4,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from shared.wire.schemas import Received, SensorId, Step, Wire
+from shared.wire.schemas import SensorId, Step
+from shared.wire.strict_models import Received, Wire
 
 # A day: an older reading says nothing about a queue.
 MAX_AGE_S = 86_400.0

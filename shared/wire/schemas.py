@@ -7,11 +7,12 @@ surveyed position (``x``, ``y``), and ``null`` in the four columns that only a b
 import operator
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
-from shared.kit.received_objects import few_names, plain
+from shared.wire.names import MapShapes, Names
 from shared.wire.problem import INCOMPLETE
 from shared.wire.reasons import Reason
+from shared.wire.strict_models import Received, Wire, one_paragraph
 from shared.world.scenario import MAX_SENSORS, Scenario
 
 MAX_STEP = 1_000_000
@@ -21,19 +22,13 @@ MAX_ROUND_TRIP_MS = 600_000.0
 MAX_NOTE = 280
 
 
-def _one_paragraph(text: str) -> str:
-    if not text.isprintable() or not text.strip():
-        raise ValueError("must be one paragraph of printable characters, without line breaks or control characters")
-    return text
-
-
 MissionId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", examples=["default"])]
 DecisionId = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$", examples=["0123456789abcdef0123456789abcdef"])]
 UavId = Annotated[int, Field(ge=0, le=99)]
 Step = Annotated[int, Field(ge=0, le=MAX_STEP)]
 SensorId = Annotated[int, Field(ge=0, lt=MAX_SENSORS)]
 Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
-Note = Annotated[str, Field(max_length=MAX_NOTE), AfterValidator(_one_paragraph)]
+Note = Annotated[str, Field(max_length=MAX_NOTE), AfterValidator(one_paragraph)]
 DeadlineMs = Annotated[int, Field(ge=10, le=60_000, description="answer within this many milliseconds")]
 
 Mode = Literal["llm", "guided", "value", "policy"]
@@ -45,23 +40,6 @@ Belief = Literal["fleet", "reported"]
 Selection = Literal["recent", "similar", "best", "failures"]
 Source = Literal["llm", "guided", "value", "policy"]
 Uplink = Literal["full", "delta", "pruned"]
-
-
-class Wire(BaseModel):
-    """Strict models: no type coercion, no NaN or infinity, no unknown fields."""
-
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
-
-
-class Received(Wire):
-    """A request's model: an object with far too many fields gives one error, not one for each field.
-
-    In Python, numpy arrays and numbers are accepted too.
-    """
-
-    # The last one runs first.
-    _plain = model_validator(mode="before")(plain)
-    _few_names = model_validator(mode="before")(few_names)
 
 
 class SensorColumns(Received):
@@ -150,7 +128,21 @@ class UavState(Received):
     progress_m: float | None = Field(
         None, ge=0, le=1e9, description="m along its trajectory, from its first waypoint (a circle's: due east)"
     )
-    # All three are omitted if not set, for the same reason as an outcome's round trip.
+    # All of these are omitted if not set, for the same reason as an outcome's round trip.
+    battery_percent: float | None = Field(
+        None,
+        ge=0,
+        le=100,
+        exclude_if=lambda value: value is None,
+        description="of the UAV's own battery; for the page and its alarm, nothing else uses it",
+    )
+    height_m: float | None = Field(
+        None,
+        ge=-1000,
+        le=1e5,
+        exclude_if=lambda value: value is None,
+        description="m above the take-off place, for the page only",
+    )
     top_speed_mps: float | None = Field(
         None,
         gt=0,
@@ -375,6 +367,16 @@ class MissionSpec(Received):
         None,
         description="the operator's note in plain words, such as `suspected leak at sensor 4: visit it every third "
         "step`",
+    )
+    names: Names | None = Field(
+        None,
+        exclude_if=lambda value: value is None,
+        description="the user's names of sensors and UAVs: on the page, and for notes",
+    )
+    map: MapShapes | None = Field(
+        None,
+        exclude_if=lambda value: value is None,
+        description="lines and areas behind the page's map; notes may use their names",
     )
 
 

@@ -71,7 +71,7 @@ def create(options: Create, console: Console) -> int:
     from simulator.world.observation_report import decide_request
 
     mission_id = options.mission or new_mission_id(site.scenario, options.seed)
-    spec = MissionSpec(scenario=site.scenario, mode=options.mode, seed=options.seed, note=options.note)
+    spec = site.named(MissionSpec(scenario=site.scenario, mode=options.mode, seed=options.seed, note=options.note))
     key = os.environ.get(API_KEY) or None
     with EdgeClient(edge, api_key=key) as client:
         made = client.put_mission(mission_id, spec)

@@ -64,6 +64,7 @@ def run_mission(
             deadline_ms=job.deadline_ms,
             probe=probe, reconnect_s=job.reconnect_s, on_wait=progress.on_wait,
         )  # fmt: skip
+        pilot.spec = job.site.named(pilot.spec)
         created = create_or_check_mission(ground, job, pilot.spec)
         watched = f"{job.edge}/?mission={job.mission_id}"
         console.print(f"Mission {job.mission_id}; watch it at {watched}", markup=False, highlight=False, soft_wrap=True)

@@ -25,11 +25,13 @@ class Fence:
         role: ``fence``: not to be left; ``no_fly``: not to be entered.
         points: the corners of a polygon, closed (the last is the first), or only the centre of a circle.
         radius: of a circle, else 0.
+        name: for people.
     """
 
     role: FenceRole
     points: tuple[Point, ...]
     radius: float = 0.0
+    name: str | None = None
 
     def allows(self, position: Point) -> bool:
         """Whether a UAV may be there; a boundary belongs to its area."""

@@ -9,6 +9,8 @@ from shared.world.scenario import Scenario
 
 # The world takes a second to import, and pyproj a tenth: commands answer `--help` and bad use without them.
 if TYPE_CHECKING:
+    from shared.wire.names import MapShape, Names
+    from shared.wire.schemas import MissionSpec
     from shared.world.channel import IntArray
     from simulator.sites.fence import Fence
     from simulator.sites.projection import Frame
@@ -28,6 +30,7 @@ class Site:
         frame: the place of the scenario's plane on the globe; ``None`` for a site that has none.
         sensor_names: the sensors' IDs on the globe, ``()`` for a site that has none.
         fences: areas that no UAV may leave or enter, metres in the scenario's plane.
+        names, map: for people, as in a mission's spec.
     """
 
     scenario: Scenario
@@ -36,6 +39,12 @@ class Site:
     frame: Frame | None = None
     sensor_names: tuple[str, ...] = ()
     fences: tuple[Fence, ...] = ()
+    names: Names | None = None
+    map: tuple[MapShape, ...] = ()
+
+    def named(self, spec: MissionSpec) -> MissionSpec:
+        """The spec with the site's names and map."""
+        return spec.model_copy(update={"names": self.names, "map": list(self.map) or None})
 
     def world(self, cost: Cost = "default") -> PipelineWorld:
         """A new world on this site."""

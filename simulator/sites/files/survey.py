@@ -10,6 +10,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pydantic_core import ErrorDetails, from_json
 
 from shared.kit.validation_messages import problem_of
+from shared.wire.names import MAX_NAME
 from shared.world.scenario import MAX_SENSORS, Point
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence, FenceRole
@@ -18,7 +19,7 @@ from simulator.sites.files.reading import json_fault, quoted, text_of
 MAX_BYTES = 20_000_000
 MAX_TRAJECTORIES, MAX_WAYPOINTS, MAX_FENCES, MAX_CORNERS = 100, 1000, 100, 1000
 MAX_RADIUS_M, MAX_PARTS = 1e6, 10_000
-ROLES = '"sensor", "trajectory", "pipeline", "fence" or "no_fly"'
+ROLES = '"sensor", "trajectory", "pipeline", "fence", "no_fly" or "background"'
 
 
 def _is_wgs84(name: str) -> bool:
@@ -93,7 +94,7 @@ def _single(geometry: Any) -> Any:
 
 
 class _Properties(_GeoJson):
-    role: Literal["sensor", "trajectory", "pipeline", "fence", "no_fly"]
+    role: Literal["sensor", "trajectory", "pipeline", "fence", "no_fly", "background"]
     id: Any = None
     name: Any = None
     radius_m: float | None = Field(None, gt=0, le=MAX_RADIUS_M)
@@ -122,6 +123,13 @@ class _Feature(_GeoJson):
         if not 1 <= len(text) <= 64:
             raise ValueError(f"{quoted(name)} is no ID; give a text of 1 to 64 letters or a whole number")
         return text
+
+    @property
+    def title(self) -> str | None:
+        """Its name for people, or else its ID: one line of printable text; ``None`` without either."""
+        names = (self.properties.name, self.properties.id, self.id)
+        text = next((_text(name) for name in names if isinstance(name, str | int) and name != ""), "")
+        return " ".join("".join(one if one.isprintable() else " " for one in text).split())[:MAX_NAME].strip() or None
 
     @property
     def parts(self) -> list[list[Point]]:
@@ -158,12 +166,17 @@ class Survey:
             equals the first.
         pipeline: polylines, for pictures.
         fences: fence by the feature's label; the radius of a circle is in metres.
+        sensor_names, uav_names: for people, in the order of the sensors and trajectories.
+        drawn: kind, name and points of the background, and of the pipeline's named sections.
     """
 
     sensors: dict[str, Point] = field(default_factory=dict)
     trajectories: dict[str, list[Point]] = field(default_factory=dict)
     pipeline: list[list[Point]] = field(default_factory=list)
     fences: dict[str, Fence] = field(default_factory=dict)
+    sensor_names: list[str | None] = field(default_factory=list)
+    uav_names: list[str | None] = field(default_factory=list)
+    drawn: list[tuple[Literal["line", "area"], str | None, list[Point]]] = field(default_factory=list)
 
 
 def read_survey(path: Path) -> Survey:
@@ -280,12 +293,14 @@ def _add(survey: Survey, label: str, feature: _Feature) -> None:
         if len(survey.sensors) == MAX_SENSORS:
             raise ValueError(f"a world has at most {MAX_SENSORS:,} sensors")
         survey.sensors[name] = feature.line[0]
+        survey.sensor_names.append(feature.title)
     elif role == "trajectory":
         if geometry == "Point":
             raise ValueError("a trajectory is a LineString (there and back) or a Polygon (laps), not a Point")
         if len(survey.trajectories) == MAX_TRAJECTORIES:
             raise ValueError(f"a world has at most {MAX_TRAJECTORIES} trajectories")
         survey.trajectories[label] = line = feature.line
+        survey.uav_names.append(feature.title)
         if len(line) > MAX_WAYPOINTS:
             raise ValueError(f"the trajectory has {len(line):,} waypoints, at most {MAX_WAYPOINTS:,}; simplify it")
     elif role == "pipeline":
@@ -294,6 +309,13 @@ def _add(survey: Survey, label: str, feature: _Feature) -> None:
         survey.pipeline += feature.parts
         if len(survey.pipeline) > MAX_PARTS:
             raise ValueError(f"the pipeline has more than {MAX_PARTS:,} parts; join them")
+        if feature.title is not None:
+            survey.drawn += (("line", feature.title, part) for part in feature.parts)
+    elif role == "background":
+        if geometry == "Point":
+            raise ValueError("the background is a LineString, MultiLineString or Polygon, not a Point")
+        kind: Literal["line", "area"] = "area" if geometry == "Polygon" else "line"
+        survey.drawn += ((kind, feature.title, part) for part in feature.parts)
     else:
         survey.fences[label] = _fence(survey, role, feature)
 
@@ -309,4 +331,4 @@ def _fence(survey: Survey, role: FenceRole, feature: _Feature) -> Fence:
         raise ValueError(f"a world has at most {MAX_FENCES} fences")
     if len(feature.line) > MAX_CORNERS + 1:
         raise ValueError(f"the {role} has {len(feature.line) - 1:,} corners, at most {MAX_CORNERS:,}; simplify it")
-    return Fence(role, tuple(feature.line), radius or 0.0)
+    return Fence(role, tuple(feature.line), radius or 0.0, feature.title)

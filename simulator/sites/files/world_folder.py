@@ -15,6 +15,7 @@ from shared.world.scenario import Point, Scenario
 from shared.world.trajectory import trajectories
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence
+from simulator.sites.files.names_and_map import names_and_map
 from simulator.sites.files.overrides import read_overrides
 from simulator.sites.files.reading import quoted
 from simulator.sites.files.recordings import read_gains, read_trace
@@ -71,6 +72,7 @@ def site_of(
         frame,
         tuple(names),
         fences,
+        *names_and_map(survey, folder / FEATURES, frame, fences),
     )
     far = [name for name, near in zip(survey.sensors, _reachable(scenario), strict=True) if not near]
     if far:
@@ -147,7 +149,7 @@ def _fences(survey: Survey, path: Path, frame: Frame, routes: Sequence[Sequence[
         polar = np.abs([latitude for _, latitude in drawn.points[1:]]) > _POLAR
         if (apart > np.where(polar, 180.0, 359.0)).any():
             raise UsageError(f"{path}, {label}: an edge goes around the Earth; give it corners that are nearer")
-        fence = Fence(drawn.role, _points(frame.metres(frame.bent(drawn.points))), drawn.radius)
+        fence = Fence(drawn.role, _points(frame.metres(frame.bent(drawn.points))), drawn.radius, drawn.name)
         for of, route in zip(survey.trajectories, routes, strict=True):
             broken = fence.first_breach(route)
             if broken is not None:

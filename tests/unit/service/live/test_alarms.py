@@ -19,7 +19,7 @@ def fly(fleet: Mission, step: int, number: int = 0, off_m: float = 0.0) -> None:
 
 
 def found(fleet: Mission) -> dict[str, dict[int, int | None]]:
-    return {kind: those for kind, those in alarms(fleet, fleet.deadlines()).items() if those}
+    return {kind: those for kind, those in alarms(fleet, fleet.deadlines(), {}).items() if those}
 
 
 def test_a_uav_that_does_not_report_for_more_than_three_steps_is_lost() -> None:

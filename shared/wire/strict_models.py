@@ -1,0 +1,29 @@
+"""The bases of the wire's models, and a check of texts."""
+
+from pydantic import BaseModel, ConfigDict, model_validator
+
+from shared.kit.received_objects import few_names, plain
+
+
+class Wire(BaseModel):
+    """Strict models: no type coercion, no NaN or infinity, no unknown fields."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+class Received(Wire):
+    """A request's model: an object with far too many fields gives one error, not one for each field.
+
+    In Python, numpy arrays and numbers are accepted too.
+    """
+
+    # The last one runs first.
+    _plain = model_validator(mode="before")(plain)
+    _few_names = model_validator(mode="before")(few_names)
+
+
+def one_paragraph(text: str) -> str:
+    """The text; raises ``ValueError`` for a blank one, or one with line breaks or control characters."""
+    if not text.isprintable() or not text.strip():
+        raise ValueError("must be one paragraph of printable characters, without line breaks or control characters")
+    return text
