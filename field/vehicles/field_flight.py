@@ -153,7 +153,7 @@ class FieldFlight:
                 self.result.undecided[uav.unavailable_reason] += 1
         choices = await self._pilot.decide(
             {index: uav.observation(step) for index, uav in flying.items()},
-            {index: uav.top_speed_m_s for index, uav in flying.items()},
+            {index: uav.of_itself() for index, uav in flying.items()},
         )
         legs = [
             _Leg(flying[index], choice, flying[index].spot(step), flying[index].flown_m)

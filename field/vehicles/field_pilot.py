@@ -79,15 +79,17 @@ class FieldPilot:
         return there
 
     async def decide(
-        self, observations: Mapping[int, Observation], top_speeds: Mapping[int, float | None] = MappingProxyType({})
+        self,
+        observations: Mapping[int, Observation],
+        of_itself: Mapping[int, Mapping[str, float]] = MappingProxyType({}),
     ) -> dict[int, PilotChoice]:
         """The choices for UAVs from their observations, in the order of the UAVs: the edge's, or the fallback's.
 
         Args:
-            top_speeds: by UAV, the ground speed, m/s, that it does not exceed, as far as that is known.
+            of_itself: by UAV, further fields of its report.
         """
         answers = await asyncio.gather(
-            *(self._answer(uav, seen, top_speeds.get(uav)) for uav, seen in observations.items())
+            *(self._answer(uav, seen, of_itself.get(uav, {})) for uav, seen in observations.items())
         )
         choices = {
             uav: found for uav, found in zip(observations, answers, strict=True) if isinstance(found, PilotChoice)
@@ -112,12 +114,11 @@ class FieldPilot:
         except (EdgeError, TimeoutError) as error:
             self.last_error = str(error) or f"no answer within {self._patience_s:g} s"
 
-    async def _answer(self, uav: int, observation: Observation, top_speed: float | None) -> PilotChoice | str:
+    async def _answer(self, uav: int, observation: Observation, of_itself: Mapping[str, float]) -> PilotChoice | str:
         """The edge's choice, or the reason why there is none."""
         outcome = self._pending_outcomes.get(uav)
         request = decide_request(uav, observation, self._mission_id, deadline_ms=self._deadline_ms, outcome=outcome)
-        if top_speed is not None:
-            request = request.model_copy(update={"top_speed_mps": top_speed})
+        request = request.model_copy(update=dict(of_itself))
         self.on_request(request)
         try:
             async with asyncio.timeout(self._patience_s):

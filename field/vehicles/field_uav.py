@@ -134,13 +134,14 @@ class FieldUav:
         self._goal_m: float | None = None
         self._fastest_m_s, self._at_top_s = 1.0, 0.0
         self._mode: FlightMode = "other"
+        self._state: VehicleState | None = None
         self.heard = HeardBeacons(np.array(site.scenario.sites))
 
     async def update(self, seconds: float) -> None:
         """Read the newest telemetry, that many seconds after the last."""
         self._since_located_s += seconds
         state = await self.vehicle.state()
-        self._mode = state.mode
+        self._mode, self._state = state.mode, state
         self.unavailable_reason = (
             self._control_fault(state) or self._position_fault(state.position) or self._climb_fault(state.height_m)
         )
@@ -156,6 +157,16 @@ class FieldUav:
     def observation(self, step: int) -> Observation:
         """The observation from the beacons that it heard."""
         return self.heard.observation(step, self._here, self._follower.progress_m or 0.0)
+
+    def of_itself(self) -> dict[str, float]:
+        """The fields of its report about itself, as far as they are known."""
+        state = self._state
+        known = {
+            "top_speed_mps": self.top_speed_m_s,
+            "battery_percent": None if state is None else state.battery_percent,
+            "height_m": None if state is None or state.position is None else state.height_m,
+        }
+        return {name: round(value, 2) for name, value in known.items() if value is not None}
 
     @property
     def flown_m(self) -> float:

@@ -176,6 +176,7 @@ class MavlinkVehicle:
         fresh = time.monotonic() - self._heard_s < STALE_S
         at = self._position
         fixed = fresh and math.isfinite(at.latitude_deg) and math.isfinite(at.longitude_deg)
+        left = (await self._telemetry.battery()).remaining_percent
         landed, flown = int(await self._telemetry.landed_state()), await self._telemetry.velocity_ned()
         return VehicleState(
             connected=bool(await self._system.is_connected()),
@@ -185,6 +186,8 @@ class MavlinkVehicle:
             height_m=at.relative_altitude_m if fixed else 0.0,
             in_air=landed != _ON_GROUND if landed else None,
             speed_m_s=math.hypot(flown.north_m_s, flown.east_m_s) if fixed else None,
+            # Not a number before the first message, and for an autopilot that does not know it.
+            battery_percent=left if 0 <= left <= 100 else None,
         )
 
     async def mission(self) -> list[MissionItem]:

@@ -22,6 +22,7 @@ class VehicleState:
         height_m: above the autopilot's home, which may be another place than that of its take-off.
         in_air: the autopilot's landed state; ``None`` where it says none.
         speed_m_s: over the ground; ``None`` where the autopilot says none.
+        battery_percent: that is left; ``None`` where the autopilot says none.
     """
 
     connected: bool
@@ -31,6 +32,7 @@ class VehicleState:
     height_m: float = 0.0
     in_air: bool | None = None
     speed_m_s: float | None = None
+    battery_percent: float | None = None
 
 
 class Vehicle(Protocol):

@@ -16,7 +16,7 @@ from mavsdk.plugins.mission_raw import MissionItem, MissionRaw
 
 from tests.support.airframe import GROUND_M, HEIGHT_M, Airframe, Item
 
-TICK_S = 0.05
+TICK_S, BATTERY_PERCENT = 0.05, 72.0
 SPEED, SET_MODE = 178, 176
 
 
@@ -81,6 +81,8 @@ class MavsdkPeer:
         while not self._ends.wait(TICK_S):
             latitude, longitude = self.airframe.position()
             position = telemetry_server.Position(latitude, longitude, GROUND_M + HEIGHT_M, HEIGHT_M)
+            # The server plugin wants a share.
+            self._telemetry.publish_battery(telemetry_server.Battery(16.0, BATTERY_PERCENT / 100))
             self._telemetry.publish_position(position, still, telemetry_server.Heading(0.0))
 
     def _change_mode(self, result: Any, mode: Any, _: object) -> None:

@@ -35,6 +35,7 @@ class StubVehicle:
         lands_at_s: from then on it lands.
         top: its highest ground speed, m/s, whatever it acknowledges.
         shift_m: how far north of its path it reports itself.
+        battery_percent: as it reports.
     """
 
     def __init__(self, site: Site, uav: int, clock: SimulatedClock, wind: float = 1.0) -> None:
@@ -42,6 +43,7 @@ class StubVehicle:
         self.commands: list[str | float] = []
         self.lands_at_s = self.top = float("inf")
         self.shift_m = 0.0
+        self.battery_percent: float | None = None
         self.deaf = self.waits_in_mission = False
         self.mode: FlightMode = "mission"
         self.flown_m = 0.0
@@ -56,6 +58,7 @@ class StubVehicle:
         longitude, latitude = self._site.frame.degrees([(x, y + self.shift_m)])[0].tolist()
         speed = self._ground_speed if self.mode == "mission" else 0.0
         state = VehicleState(True, True, self.mode, (longitude, latitude), 100.0, speed_m_s=speed)
+        state = replace(state, battery_percent=self.battery_percent)
         return replace(state, mode="landing") if self._clock.now() >= self.lands_at_s else state
 
     async def mission(self) -> list[MissionItem]:

@@ -161,6 +161,14 @@ async def test_the_progress_flown_counts_not_the_speed_commanded() -> None:
     assert uav.flown_m == pytest.approx(6.0 + 6.75 + 7.88 + 9.84 + 14.0, abs=0.1)
 
 
+async def test_reports_have_the_battery_where_the_autopilot_says_it_and_the_height(edge: Edge) -> None:
+    trial = Trial(steps=2)
+    trial.vehicles[1].battery_percent = 61.5
+    await trial.fly(str(edge(mode="policy").base_url))
+    assert {r.uav_id: r.battery_percent for r in trial.requests} == {0: None, 1: 61.5, 2: None}
+    assert {r.height_m for r in trial.requests} == {100.0}
+
+
 async def test_the_edge_decides_no_velocity_that_an_airframe_was_seen_not_to_reach(edge: Edge) -> None:
     trial, url = Trial(), str(edge(mode="policy").base_url)
     for vehicle in trial.vehicles[:2]:

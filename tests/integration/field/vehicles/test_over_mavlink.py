@@ -24,7 +24,7 @@ from tests.conftest import Edge
 from tests.support.airframe import EARTH_M, Item, once
 from tests.support.edge_stub import free_port
 from tests.support.flights import arguments, becomes
-from tests.support.mavsdk_peer import SET_MODE, SPEED, mavsdk_peer
+from tests.support.mavsdk_peer import BATTERY_PERCENT, SET_MODE, SPEED, mavsdk_peer
 from tests.support.processes import output_until, run_here, started
 from tests.support.pymavlink_peer import DEFAULT_SPEED, pymavlink_peer
 from tests.support.waiting import PATIENCE_S, until
@@ -140,6 +140,19 @@ def test_the_wire_by_pymavlink_positions_speeds_and_a_lost_link(
     assert max(gap_m(d, peer.airframe.trace) for d in decisions) < 1
     missing = sorted(set(range(36)) - {d.step for d in decisions})
     assert len(missing) >= 2 and missing == list(range(missing[0], missing[-1] + 1))
+
+
+async def test_the_battery_is_what_the_autopilot_says(missions: list[list[Item]], port: int) -> None:
+    with mavsdk_peer(missions[0], port):
+        async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle, asyncio.timeout(PATIENCE_S):
+            while (percent := (await vehicle.state()).battery_percent) is None:
+                await asyncio.sleep(0.05)
+            assert percent == BATTERY_PERCENT
+    with pymavlink_peer(missions[0], port):
+        async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle, asyncio.timeout(PATIENCE_S):
+            while (state := await vehicle.state()).position is None:
+                await asyncio.sleep(0.05)
+            assert state.battery_percent is None, "it sends none"
 
 
 async def test_who_flies_the_vehicle(missions: list[list[Item]], port: int) -> None:
