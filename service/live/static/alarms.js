@@ -5,13 +5,14 @@ import { at, make, shown } from "./dom.js";
 const SOON_STEPS = 2;
 const UNHEARD_STEPS = 10;
 const BATTERY = 0.15;
+const UAV_BATTERY = 25;
 const MOST_NAMED = 12;
 const LATELY = 30;
 const LLM_FAULTS = ["degraded", "unavailable"];
 
 /** Show a mission's alarms, or nothing where there are none; `ready`: the edge's answer to `/readyz`. */
 export function showAlarms(mission, ready) {
-  const found = [...ofTheEdge(mission, ready), ...alarms(mission.now, mission.scenario.queue_capacity)];
+  const found = [...ofTheEdge(mission, ready), ...alarms(mission)];
   if (showAlarms.mission !== mission) [showAlarms.mission, showAlarms.since] = [mission, new Map()];
   // An alarm that knows no step has been there since this page saw it first.
   showAlarms.since = new Map(found.map(({ name, since }) => [name, since ?? showAlarms.since.get(name) ?? mission.now.step]));
@@ -39,27 +40,32 @@ function ofTheEdge(mission, ready) {
 }
 
 /** The alarms of UAVs and sensors; the most urgent first. */
-export function alarms(now, capacity) {
+export function alarms(mission) {
+  const { now } = mission;
+  const capacity = mission.scenario.queue_capacity;
+  const sensor = (id) => mission.sensor(id);
+  const craft = (id) => mission.uav(id, "UAV ");
   const ids = [...now.queue.keys()];
   const heard = ids.filter((id) => now.heard[id] >= 0);
   const full = heard.filter((id) => now.queue[id] >= capacity - 0.5);
   const soon = heard.filter((id) => !full.includes(id) && now.full_in[id] <= SOON_STEPS).sort((a, b) => now.full_in[a] - now.full_in[b]);
   const unheard = ids.filter((id) => now.step - now.heard[id] > UNHEARD_STEPS).sort((a, b) => now.heard[a] - now.heard[b]);
   const worse = Object.keys(now.excess_db).sort((a, b) => now.excess_db[b] - now.excess_db[a]);
-  const { uav_lost: lost, uav_off_path: off, visit_late: late, sensor_battery: battery } = now.alarms;
+  const { uav_lost: lost, uav_off_path: off, uav_battery: flat, visit_late: late, sensor_battery: battery } = now.alarms;
   const low = Object.keys(battery).sort((a, b) => now.battery[a] - now.battery[b]);
   const steps = (since) => Object.values(since).map((step) => ({ step }));
   return [
-    alarm("UAV lost", Object.keys(lost).map((id) => `UAV ${id} (step ${lost[id]})`), "Look for it at its last place on the map; the others' plans leave it out.", steps(lost)),
-    alarm("UAV off its path", Object.keys(off).map((id) => `UAV ${id}`), "Look at its autopilot: wind, another mission, or a pilot moves it."),
-    alarm("Visit late", Object.keys(late).map((id) => `S${id} (due at step ${late[id]})`), "Give it a weight, or withdraw other orders.", steps(late)),
-    alarm("Believed full", full.map((id) => `S${id}`), "It loses packets: order a visit."),
-    alarm(`Full within ${SOON_STEPS} steps`, soon.map((id) => `S${id} (${shown(now.full_in[id])})`), "It will lose packets: order a visit."),
-    alarm("In radio range but not heard", Object.keys(now.silent).map((id) => `S${id} (step ${now.silent[id]})`), "Look at its radio and battery."),
-    alarm(`Not heard for more than ${UNHEARD_STEPS} steps`, unheard.map((id) => `S${id} (${now.heard[id] < 0 ? "never" : `step ${now.heard[id]}`})`), "Whether its queue overflows is unknown: order a visit."),
-    alarm("Radio probably dead", now.failed_radios.map((id) => `S${id}`), "No visit brings its packets: repair it."),
-    alarm("Links worse than modelled", worse.map((id) => `S${id} (${shown(now.excess_db[id], 0)} dB)`), "Fly slower past it, or free its line of sight."),
-    alarm(`Battery below ${100 * BATTERY}%`, low.map((id) => `S${id} (${shown(100 * now.battery[id], 0)}%)`), "Change its battery."),
+    alarm("UAV lost", Object.keys(lost).map((id) => `${craft(id)} (step ${lost[id]})`), "Look for it at its last place on the map; the others' plans leave it out.", steps(lost)),
+    alarm("UAV off its path", Object.keys(off).map(craft), "Look at its autopilot: wind, another mission, or a pilot moves it."),
+    alarm(`UAV battery below ${UAV_BATTERY}%`, Object.keys(flat).map((id) => `${craft(id)} (${shown(now.uavs[id]?.battery, 0)}%)`), "Bring it home while it still flies by your command."),
+    alarm("Visit late", Object.keys(late).map((id) => `${sensor(id)} (due at step ${late[id]})`), "Give it a weight, or withdraw other orders.", steps(late)),
+    alarm("Believed full", full.map(sensor), "It loses packets: order a visit."),
+    alarm(`Full within ${SOON_STEPS} steps`, soon.map((id) => `${sensor(id)} (${shown(now.full_in[id])})`), "It will lose packets: order a visit."),
+    alarm("In radio range but not heard", Object.keys(now.silent).map((id) => `${sensor(id)} (step ${now.silent[id]})`), "Look at its radio and battery."),
+    alarm(`Not heard for more than ${UNHEARD_STEPS} steps`, unheard.map((id) => `${sensor(id)} (${now.heard[id] < 0 ? "never" : `step ${now.heard[id]}`})`), "Whether its queue overflows is unknown: order a visit."),
+    alarm("Radio probably dead", now.failed_radios.map(sensor), "No visit brings its packets: repair it."),
+    alarm("Links worse than modelled", worse.map((id) => `${sensor(id)} (${shown(now.excess_db[id], 0)} dB)`), "Fly slower past it, or free its line of sight."),
+    alarm(`Battery below ${100 * BATTERY}%`, low.map((id) => `${sensor(id)} (${shown(100 * now.battery[id], 0)}%)`), "Change its battery."),
   ].filter(({ who }) => who.length > 0);
 }
 

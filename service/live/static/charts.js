@@ -45,7 +45,8 @@ export class Charts {
     this.plots = {};
     this.later = null;
     onTheme(() => this.begin());
-    new ResizeObserver(() => this.#resize()).observe(at("loss"));
+    const resized = new ResizeObserver(() => this.#resize());
+    for (const name of Object.keys(CHARTS)) resized.observe(at(name));
   }
 
   /** Begin anew: another mission, or other colours. */
@@ -76,15 +77,18 @@ export class Charts {
       at(name).closest("figure").hidden = hidden;
       if (hidden) continue;
       const rows = chart.rows(steps);
+      say(at(`${name}-text`), chart.text(rows, steps));
+      // It is drawn once its details are opened.
+      if (!at(name).clientWidth) continue;
       const data = [steps.map(([number]) => number), ...rows];
       if (this.plots[name]) this.plots[name].setData(data);
       else this.plots[name] = plotted(name, chart, data);
-      say(at(`${name}-text`), chart.text(rows, steps));
     }
   }
 
   #resize() {
-    for (const [name, plot] of Object.entries(this.plots)) plot.setSize({ width: at(name).clientWidth, height: HEIGHT });
+    for (const [name, plot] of Object.entries(this.plots)) if (at(name).clientWidth) plot.setSize({ width: at(name).clientWidth, height: HEIGHT });
+    if (this.mission && Object.keys(CHARTS).some((name) => !this.plots[name] && at(name).clientWidth)) this.#draw();
   }
 }
 

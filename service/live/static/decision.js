@@ -9,28 +9,29 @@ let opened = null;
 
 at("decision-close").addEventListener("click", () => at("decision").close());
 
-/** Show a decision; its prompt is asked for. `asks`: whether the mission's mode asks an LLM. */
-export function open(decision, asks) {
+/** Show a mission's decision; its prompt is asked for. */
+export function open(decision, mission) {
+  const { asks } = mission.about;
   const { answer } = decision;
   opened = answer.decision_id;
-  say(at("decision-title"), `Step ${answer.step}: U${answer.uav_id} to S${answer.sensor_id} at ${answer.velocity} m/s`);
+  say(at("decision-title"), `Step ${answer.step}: ${mission.uav(answer.uav_id)} to ${mission.sensor(answer.sensor_id)} at ${answer.velocity} m/s`);
   const prompt = make("section", {}, make("h3", {}, "Prompt"), make("p", {}, "Asking the edge for it…"));
   const said = why(answer);
   at("decision-body").replaceChildren(
     make("p", {}, make("span", { class: "who", "data-source": answer.source }, decider(answer)), said ? ` ${said}` : ""),
-    candidates(answer), ...trust(answer), times(decision), ...(asks ? [tokens(answer)] : []), prompt);
+    candidates(answer, mission), ...trust(answer), times(decision), ...(asks ? [tokens(answer)] : []), prompt);
   if (!at("decision").open) at("decision").showModal();
   at("decision-title").focus();
   showPrompt(answer, prompt);
 }
 
-function candidates(answer) {
+function candidates(answer, mission) {
   const chosen = (row) => row.sensor_id === answer.sensor_id && (row.velocity ?? answer.velocity) === answer.velocity;
   const guided = answer.guided?.candidates;
   const columns = guided
-    ? [["Sensor", (c) => c.sensor_id], ["m/s", (c) => c.velocity], ["LLM", (c) => (c.llm === null ? "silent" : c.llm.toFixed(3))],
+    ? [["Sensor", (c) => mission.sensor(c.sensor_id)], ["m/s", (c) => c.velocity], ["LLM", (c) => (c.llm === null ? "silent" : c.llm.toFixed(3))],
        ["Advisers", (c) => c.mixture.toFixed(3)], ["Expected loss", (c) => c.regret.toFixed(2)], ["Score", (c) => c.score.toFixed(2)]]
-    : [["Sensor", (c) => c.sensor_id], ["Attention score", (c) => c.score.toFixed(3)]];
+    : [["Sensor", (c) => mission.sensor(c.sensor_id)], ["Attention score", (c) => c.score.toFixed(3)]];
   const rows = (guided ?? answer.top_k).map((row) =>
     make("tr", chosen(row) ? { class: "chosen" } : {}, ...columns.map(([, cell]) => make("td", {}, String(cell(row)))), make("td", {}, chosen(row) ? "flown" : "")));
   const head = make("tr", {}, ...columns.map(([name]) => make("th", { scope: "col" }, name)), make("td", {}));

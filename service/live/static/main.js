@@ -5,6 +5,7 @@ import { Charts } from "./charts.js";
 import { open } from "./decision.js";
 import { at, make, say, set } from "./dom.js";
 import { ask, events, hasKey, Refused, useKey } from "./edge.js";
+import { showClock, showFleet } from "./fleet.js";
 import { Feed } from "./feed.js";
 import { MissionMap } from "./map.js";
 import { Mission } from "./model.js";
@@ -27,10 +28,10 @@ let remark = null;
 let mayCommand = false;
 let ready = null;
 
-const feed = new Feed((id) => mission?.decisions.has(id) && open(mission.decisions.get(id), mission.about.asks));
+const feed = new Feed((id) => mission?.decisions.has(id) && open(mission.decisions.get(id), mission));
 const map = new MissionMap((kind, id) => {
   const last = mission.newest(1000).find(({ answer }) => (kind === "uav" ? answer.uav_id : answer.sensor_id) === id);
-  if (last) open(last, mission.about.asks);
+  if (last) open(last, mission);
 });
 const charts = new Charts();
 const operator = new Operator();
@@ -218,6 +219,7 @@ function draw() {
   charts.update(mission);
   showNumbers(mission);
   showAlarms(mission, ready);
+  showFleet(mission);
   operator.update(mission, mayCommand);
   badge();
   document.title = `${mission.id} · AIC-VDS`;
@@ -239,4 +241,9 @@ at("pause").addEventListener("click", () => {
   if (!paused) draw();
 });
 
+setInterval(() => {
+  showClock(mission);
+  if (mission && !paused) showFleet(mission);
+}, 1000);
+showClock(null);
 list();

@@ -1,12 +1,14 @@
-// The map: pipeline, trajectories, sensors (disc: queue; ring: urgency), UAVs, and trails in the colour of their latency.
+// The map over its ground: sensors (disc: queue; ring: urgency), UAVs, and trails in the colour of their latency.
 
 import { latencyScale, onTheme, viridis } from "./colours.js";
 import { at, draw, make, say, set, shown } from "./dom.js";
+import { best, ground, short, titles } from "./ground.js";
 import { latency } from "./model.js";
 
 const MARGIN_PX = 26;
 const TRAIL_SEGMENTS = 60;
 const MOST_SEGMENTS = 1200;
+const FENCES = ["fence", "no_fly"];
 
 export class MissionMap {
   constructor(onChoose) {
@@ -36,10 +38,12 @@ export class MissionMap {
     const uavs = draw("g", {});
     const { places } = mission;
     this.radius = places.length <= 30 ? 11 : places.length <= 150 ? 8 : places.length <= 1000 ? 4 : 2.5;
-    this.taken = places.flatMap((place) => (place[0] === null ? [] : [[this.x(place[0]), this.y(place[1])]]));
+    const r = this.radius;
+    this.boxes = places.flatMap((place) => (place[0] === null ? [] : [[this.x(place[0]) - r, this.y(place[1]) - r, 2 * r, 2 * r]]));
+    const under = ground(mission, this);
     places.forEach((place, id) => place[0] !== null && sensors.append(this.#sensor(id, place)));
     this.uavs = uavs;
-    this.svg.replaceChildren(this.#ground(mission), this.trails, this.links, sensors, uavs);
+    this.svg.replaceChildren(under, this.trails, this.links, titles(mission, this), sensors, uavs);
     this.segments = new Map();
     this.update(mission);
     set(this.svg.querySelector(".mark") ?? this.svg, { tabindex: 0 });
@@ -62,7 +66,9 @@ export class MissionMap {
       mark.group.classList.toggle("unheard", heard[id] < 0);
       const known = heard[id] < 0 ? "never heard" : `last heard at step ${heard[id]}`;
       const visit = visits[id] < 0 ? "no visit" : `last visit at step ${visits[id]}`;
-      mark.text = `Sensor ${id}: queue ${shown(queue[id])} of ${capacity} packets, ${fullIn(mission.now.full_in[id])}, urgency ${(urgency[id] ?? 0).toFixed(2)}, ${known}, ${visit}`;
+      const held = heard[id] < 0 ? `queue unknown, taken for ${shown(queue[id])} of ${capacity} packets` : `queue ${shown(queue[id])} of ${capacity} packets, ${fullIn(mission.now.full_in[id])}`;
+      const left = heard[id] < 0 ? "battery unknown" : `battery ${shown(100 * mission.now.battery[id], 0)}%`;
+      mark.text = `${this.#named("Sensor", id, mission.names?.sensors[id])}: ${held}, urgency ${(urgency[id] ?? 0).toFixed(2)}, ${known}, ${visit}, ${left}`;
       set(mark.group, { "aria-label": mark.text });
     }
     const newest = this.#paths(mission);
@@ -71,8 +77,12 @@ export class MissionMap {
     say(at("readout"), described?.text ?? "Point at a sensor or a UAV, or move with the arrow keys, to read its numbers.");
   }
 
+  #named(kind, id, name) {
+    return name ? `${name} (${kind === "UAV" ? kind : kind.toLowerCase()} ${id})` : `${kind} ${id}`;
+  }
+
   #fit(mission) {
-    const points = [...mission.trajectories.flat()];
+    const points = [...mission.trajectories.flat(), ...mission.map.filter(({ kind }) => FENCES.includes(kind)).flatMap((one) => one.points)];
     points.push(...mission.pipeline, ...mission.places.filter((place) => place[0] !== null));
     const low = [0, 1].map((axis) => points.reduce((least, p) => Math.min(least, p[axis]), Infinity));
     const high = [0, 1].map((axis) => points.reduce((most, p) => Math.max(most, p[axis]), -Infinity));
@@ -85,24 +95,7 @@ export class MissionMap {
     this.x = (x) => px(left + (x - low[0]) * this.scale);
     this.y = (y) => px(height - MARGIN_PX - (y - low[1]) * this.scale);
     set(this.svg, { viewBox: `0 0 ${width} ${Math.round(height)}` });
-    this.size = [width, height];
-  }
-
-  #line(points, attributes) {
-    return draw("polyline", { points: points.map(([x, y]) => `${this.x(x)},${this.y(y)}`).join(" "), ...attributes });
-  }
-
-  #ground(mission) {
-    const side = mission.scenario.area_m;
-    const ground = draw("g", { "aria-hidden": "true" });
-    ground.append(this.#line([[0, 0], [side, 0], [side, side], [0, side], [0, 0]], { class: "area" }));
-    if (mission.pipeline.length) ground.append(this.#line(mission.pipeline, { class: "pipeline" }));
-    ground.append(...mission.trajectories.map((curve) => this.#line(curve, { class: "trajectory" })));
-    const metres = [10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 50_000, 100_000].findLast((m) => m * this.scale < 130) ?? 10;
-    const [x, y] = [MARGIN_PX, this.size[1] - 8];
-    ground.append(draw("path", { class: "bar", d: `M${x} ${y - 4}v4h${px(metres * this.scale)}v-4` }));
-    ground.append(draw("text", { class: "bar-text", x: x + 6, y: y - 5 }, `${metres.toLocaleString("en")} m`));
-    return ground;
+    [this.width, this.height, this.left] = [width, height, MARGIN_PX];
   }
 
   #sensor(id, [x, y]) {
@@ -110,28 +103,26 @@ export class MissionMap {
     const disc = draw("circle", { class: "queue", r: 0 });
     const ring = draw("circle", { class: "urgency", r, pathLength: 1, transform: "rotate(-90)", "stroke-width": Math.max(1.5, r * 0.34) });
     const parts = [draw("circle", { class: "hit", r: Math.max(12, r * 1.6) }), draw("circle", { class: "body", r }), disc, ring];
-    if (r >= 8) parts.push(draw("text", { class: "label", ...this.#spot(id, r) }, `S${id}`));
+    if (r >= 8) parts.push(...this.#label(id, r));
     const attributes = { class: "mark sensor", id: `sensor-${id}`, role: "button", tabindex: -1, transform: `translate(${this.x(x)} ${this.y(y)})` };
     const group = draw("g", attributes, ...parts);
     this.marks.set(group.id, { kind: "sensor", id, group, disc, ring, text: "" });
     return group;
   }
 
-  /** Where a sensor's label is farthest from the other sensors and their labels, relative to the sensor. */
-  #spot(id, r) {
-    const here = this.mission.places[id];
-    const [x, y] = [this.x(here[0]), this.y(here[1])];
-    const free = ([dx, dy]) => Math.min(60, ...this.taken.map(([ox, oy]) => Math.hypot(x + dx - ox, (y + dy - oy) * 1.6)));
-    const spots = [[0, -r - 6], [0, r + 10], [r + 12, 2], [-r - 12, 2]];
-    const best = spots.reduce((found, spot) => (free(spot) > free(found) + 1 ? spot : found));
-    this.taken.push([x + best[0], y + best[1]]);
-    return { x: best[0], y: best[1] + 2 };
+  /** A sensor's label at the place beside it that covers least, if any is free; its readout has the whole name. */
+  #label(id, r) {
+    const [x, y] = [this.x(this.mission.places[id][0]), this.y(this.mission.places[id][1])];
+    const text = short(this.mission.sensor(id));
+    const aside = r + 5 + 3.2 * text.length;
+    const spot = best(this, [[x, y - r - 7], [x, y + r + 8], [x + aside, y], [x - aside, y]], text, 0.2);
+    return spot ? [draw("text", { class: "label", x: px(spot[0] - x), y: px(spot[1] - y + 4) }, text)] : [];
   }
 
   #uav(id) {
     const body = draw("path", { class: "craft", d: "M0-11L8 8 0 4-8 8z" });
     const attributes = { class: "mark uav", id: `uav-${id}`, role: "button", tabindex: -1 };
-    const group = draw("g", attributes, draw("circle", { class: "hit", r: 16 }), body, draw("text", { class: "label", x: 11, y: -7 }, `U${id}`));
+    const group = draw("g", attributes, draw("circle", { class: "hit", r: 16 }), body, draw("text", { class: "label", x: 11, y: -7 }, short(this.mission.uav(id))));
     const link = draw("line", { class: "link" });
     this.uavs.append(group);
     this.links.append(link);
@@ -158,8 +149,8 @@ export class MissionMap {
       set(mark.link, shownLink
         ? { x1: this.x(position[0]), y1: this.y(position[1]), x2: this.x(sensor[0]), y2: this.y(sensor[1]), visibility: null }
         : { visibility: "hidden" });
-      const told = answer ? `collects from sensor ${answer.sensor_id} at ${answer.velocity} m/s, decided by ${answer.source} in ${shown(latency(last.decision))} ms` : "not told anything yet";
-      mark.text = `UAV ${id} at step ${reported}, ${shown(position[0], 0)} m east, ${shown(position[1], 0)} m north: ${told}`;
+      const told = answer ? `collects from ${mission.names?.sensors[answer.sensor_id] ?? `sensor ${answer.sensor_id}`} at ${answer.velocity} m/s, decided by ${answer.source} in ${shown(latency(last.decision))} ms` : "not told anything yet";
+      mark.text = `${this.#named("UAV", id, mission.names?.uavs[id])} at step ${reported}, ${shown(position[0], 0)} m east, ${shown(position[1], 0)} m north: ${told}`;
       set(mark.group, { "aria-label": mark.text });
     }
   }
@@ -233,6 +224,8 @@ export class MissionMap {
           draw("circle", { class: "urgency", r: 10, pathLength: 1, "stroke-dasharray": "0.7 2", transform: "rotate(-90)", "stroke-width": 3.4 }))), "ring: urgency; a full circle is 1"),
       key(draw("svg", { width: 26, height: 26, viewBox: "-13 -13 26 26", "aria-hidden": "true" },
         draw("g", { class: "uav" }, draw("path", { class: "craft", d: "M0-11L8 8 0 4-8 8z" }))), "UAV, and the sensor that it collects from"),
+      ...FENCES.filter((kind) => this.mission.map.some((one) => one.kind === kind)).map((kind) =>
+        key(draw("svg", { width: 26, height: 14, "aria-hidden": "true" }, draw("rect", { class: `shape ${kind}`, x: 2, y: 2, width: 22, height: 10 })), kind === "fence" ? "fence: not to be left" : "no-fly area")),
       key(bar, `trail: ${shown(scale.low)} to ${shown(scale.high)} ms, ${whose}`));
   }
 

@@ -28,6 +28,8 @@ export class Mission {
     this.pipeline = snapshot.pipeline;
     this.trajectories = snapshot.trajectories;
     this.places = snapshot.places;
+    this.names = snapshot.names;
+    this.map = snapshot.map;
     this.apply(snapshot);
   }
 
@@ -40,9 +42,24 @@ export class Mission {
     this.heardAt = performance.now();
   }
 
+  /** A sensor for people: its name, or else its ID. */
+  sensor(id) {
+    return this.names?.sensors[id] ?? `S${id}`;
+  }
+
+  /** A UAV for people. */
+  uav(id, kind = "U") {
+    return this.names?.uavs[id] ?? `${kind}${id}`;
+  }
+
+  /** Seconds since the newest update. */
+  get age() {
+    return (performance.now() - this.heardAt) / 1000;
+  }
+
   /** Seconds since the edge's last decision; null before the first. */
   get idleS() {
-    return this.now.idle_s === null ? null : this.now.idle_s + (performance.now() - this.heardAt) / 1000;
+    return this.now.idle_s === null ? null : this.now.idle_s + this.age;
   }
 
   /** Whether every UAV has its decision of the mission's last step, or those that have none no longer ask. */

@@ -20,14 +20,14 @@ export function showNumbers(mission) {
   const full = now.queue.filter((packets, id) => now.heard[id] >= 0 && packets >= scenario.queue_capacity - 0.5).length;
   const unknown = now.heard.filter((step) => step < 0).length;
   cell("Step", String(now.step), `of ${scenario.steps}, from 0; ${scenario.step_s} s each`);
-  cell("Decisions", shown(now.made, 0), [...sources].sort((a, b) => b[1] - a[1]).map(([source, n]) => `${n} ${SOURCES[source] ?? source}`).join(", ") || "none yet");
   cell("Overflows", `≈ ${shown(now.overflows, 0)}`, `believed; a sensor counts once a step. ${full} full now${unknown ? `; unknown of ${unknown} never heard` : ""}`);
   cell("Failed", String(totals.failed), totals.told ? `of ${totals.told} reported transmissions; cost ${shown(totals.cost, 1)}, with losses in reach only` : "no transmission reported yet");
   cell(roundTrip ? "Round trip" : "Edge's time", typical === null ? "–" : `${shown(typical)} ms`,
     typical === null ? "no decision yet" : `median of the newest ${times.length}; slowest ${shown(times.at(-1))} ms`, "time");
+  cell("Decisions", shown(now.made, 0), [...sources].sort((a, b) => b[1] - a[1]).map(([source, n]) => `${n} ${SOURCES[source] ?? source}`).join(", ") || "none yet", "Decisions", "deciders-numbers");
   if (about.asks && totals.seen) {
     cell("Tokens saved", totals.uncompressed ? `${shown((100 * totals.saved) / totals.uncompressed, 0)}%` : "–",
-      `${shown(totals.saved / totals.seen, 0)} of ${shown(totals.uncompressed / totals.seen, 0)} a decision`);
+      `${shown(totals.saved / totals.seen, 0)} of ${shown(totals.uncompressed / totals.seen, 0)} a decision`, "tokens", "deciders-numbers");
   }
   say(at("about"), described(mission, lately));
   tell(mission, typical, roundTrip);
@@ -38,6 +38,7 @@ export function clearNumbers() {
   cells.clear();
   said = 0;
   at("numbers").replaceChildren();
+  at("deciders-numbers").replaceChildren();
 }
 
 /** The mission's mode, LLM and planner, and the weight of each adviser. */
@@ -51,10 +52,10 @@ function described({ about, scenario, now }, lately) {
   return parts.join(" · ");
 }
 
-function cell(name, value, detail, key = name) {
+function cell(name, value, detail, key = name, list = "numbers") {
   if (!cells.has(key)) {
     const parts = [make("dt"), make("dd", { class: "value" }), make("dd", { class: "detail" })];
-    at("numbers").append(make("div", {}, ...parts));
+    at(list).append(make("div", {}, ...parts));
     cells.set(key, parts);
   }
   [name, value, detail].forEach((text, i) => say(cells.get(key)[i], text));
@@ -66,5 +67,5 @@ function tell(mission, typical, roundTrip) {
   const { now, totals } = mission;
   const urgent = now.urgency.indexOf(now.urgency.reduce((most, one) => Math.max(most, one), 0));
   const time = typical === null ? "" : ` ${roundTrip ? "Round trip" : "Edge's time"} ${shown(typical)} milliseconds.`;
-  say(at("summary"), `Mission ${mission.id}, step ${now.step}: ${now.made} decisions, about ${shown(now.overflows, 0)} overflows, ${totals.failed} failed transmissions.${time} Most urgent: sensor ${urgent}, ${shown(now.queue[urgent], 0)} packets.`);
+  say(at("summary"), `Mission ${mission.id}, step ${now.step}: ${now.made} decisions, about ${shown(now.overflows, 0)} overflows, ${totals.failed} failed transmissions.${time} Most urgent: ${mission.names?.sensors[urgent] ?? `sensor ${urgent}`}, ${shown(now.queue[urgent], 0)} packets.`);
 }
