@@ -59,7 +59,7 @@ export function best(view, spots, text, share) {
 }
 
 /** A name that fits on the map. */
-export const short = (name) => (name.length > MOST_LETTERS ? `${name.slice(0, MOST_LETTERS - 1)}…` : name);
+export const short = (name, most = MOST_LETTERS) => (name.length > most ? `${name.slice(0, most - 1).trimEnd()}…` : name);
 
 function shape(view, { kind, points }) {
   const closed = kind === "line" ? points : [...points, points[0]];

@@ -115,14 +115,14 @@ export class MissionMap {
     const [x, y] = [this.x(this.mission.places[id][0]), this.y(this.mission.places[id][1])];
     const text = short(this.mission.sensor(id));
     const aside = r + 5 + 3.2 * text.length;
-    const spot = best(this, [[x, y - r - 7], [x, y + r + 8], [x + aside, y], [x - aside, y]], text, 0.2);
+    const spot = best(this, [[x, y - r - 7], [x, y + r + 8], [x + aside, y], [x - aside, y]], text, 0.1);
     return spot ? [draw("text", { class: "label", x: px(spot[0] - x), y: px(spot[1] - y + 4) }, text)] : [];
   }
 
   #uav(id) {
     const body = draw("path", { class: "craft", d: "M0-11L8 8 0 4-8 8z" });
     const attributes = { class: "mark uav", id: `uav-${id}`, role: "button", tabindex: -1 };
-    const group = draw("g", attributes, draw("circle", { class: "hit", r: 16 }), body, draw("text", { class: "label", x: 11, y: -7 }, short(this.mission.uav(id))));
+    const group = draw("g", attributes, draw("circle", { class: "hit", r: 16 }), body, draw("text", { class: "label", x: 11, y: -7 }, short(this.mission.uav(id), 11)));
     const link = draw("line", { class: "link" });
     this.uavs.append(group);
     this.links.append(link);

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -13,7 +13,10 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 
+from service.api.app import create_app
+from service.config.settings import Settings
 from tests.support.processes import serving_edge
+from tests.support.running import serving
 from tests.support.waiting import PATIENCE_S
 
 # As root, without a sandbox of its own, and without its calls home, which a closed network would refuse one by one.
@@ -29,9 +32,26 @@ _FLAGS = [
 
 expect.set_options(timeout=PATIENCE_S * 1e3)
 
+REFUSED = ("Failed to load resource",)
+HOSTILE = '<img src=x onerror="window.hacked = 1"><script>window.hacked = 1</script>'
+
 Start = Callable[..., tuple[str, subprocess.Popen[str]]]
 Open = Callable[..., Page]
 Report = Callable[..., dict[str, Any]]
+
+
+@contextmanager
+def edge_here() -> Iterator[str]:
+    """An edge in this process, which decides by learned values."""
+    with serving(create_app(Settings(mode="value", deadline_ms=60_000))) as url:
+        yield url
+
+
+@pytest.fixture(scope="module")
+def edge() -> Iterator[str]:
+    """One for the tests that need none of their own; each has missions of its own name there."""
+    with edge_here() as url:
+        yield url
 
 
 def violations(page: Page) -> list[str]:

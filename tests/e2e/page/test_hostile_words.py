@@ -70,7 +70,10 @@ def harmless(page: Page) -> None:
 @pytest.mark.parametrize("note", NOTES)
 def test_the_mission_page(visit: Open, report: Report, note: str, width: int) -> None:
     with hostile_edge() as edge:
-        httpx.put(f"{edge}/missions/m", json={"note": note}, timeout=PATIENCE_S).raise_for_status()
+        names = [SCRIPT[:64], ENDS[:64], LONG[:64]]
+        area = {"kind": "no_fly", "name": SCRIPT[:64], "points": [[0, 0], [900, 0], [900, 900]]}
+        spec = {"note": note, "names": {"sensors": names, "uavs": names}, "map": [area, area | {"name": LONG[:64]}]}
+        httpx.put(f"{edge}/missions/m", json=spec, timeout=PATIENCE_S).raise_for_status()
         for step in range(12):
             body = report(mission_id="m", step=step)
             httpx.post(f"{edge}/decide", json=body, timeout=PATIENCE_S).raise_for_status()

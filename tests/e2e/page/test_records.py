@@ -59,7 +59,7 @@ def flown(edge: str, out: Path, scenario: str, mode: str) -> Records:
 def tiles(page: Page) -> dict[str, tuple[str, str]]:
     """The page's tiles: value and detail by name."""
     names, values, details = (
-        page.locator(f"#numbers {part}").all_inner_texts() for part in ("dt", ".value", ".detail")
+        page.locator(f".numbers {part}").all_text_contents() for part in ("dt", ".value", ".detail")
     )
     return {name: (value, detail) for name, value, detail in zip(names, values, details, strict=True)}
 
@@ -87,7 +87,7 @@ def test_nothing_contradicts_the_records(visit: Open, edge: str, tmp_path: Path,
     assert ("Tokens saved" in found) == (mode in ("guided", "llm"))
     for card in page.locator("#feed .by").all_inner_texts():
         assert any(card.startswith(WORDS[source]) for source in sources if source != "onboard")
-    assert f"mode {mode}" in page.locator("#about").inner_text()
+    assert f"mode {mode}" in page.locator("#about").text_content()
 
 
 def check_report(records: Records, sources: Counter[str], failed: int) -> None:
