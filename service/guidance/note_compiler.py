@@ -22,6 +22,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from service.guidance.lettered_orders import STATIC, NoteReading, grammar, meaning
+from service.guidance.named_places import NamedPlaces
 from service.guidance.note_numbers import LetteredNote
 from service.guidance.note_orders import INSTRUCTION, BadOrders, parse_orders, similar_examples
 from service.guidance.operator_guidance import OperatorGuidance
@@ -120,6 +121,11 @@ class NoteOwner(Protocol):
     scenario: Scenario
     guidance: OperatorGuidance
 
+    @property
+    def named_places(self) -> NamedPlaces:
+        """What a note may name."""
+        ...
+
     def propose_guidance(self, guidance: Guidance, model: str | None, doubts: Sequence[str] = ()) -> None:
         """Propose the guidance that an LLM made of the note."""
         ...
@@ -170,9 +176,10 @@ class NoteCompiler:
                 await self._wait_for_llm()
                 if not _waits_for(mission, note):
                     return
-                compiled = await compile_note(note, mission.scenario, self._llm)
+                text, unclear = await asyncio.to_thread(lambda: mission.named_places.in_ids(note))
+                compiled = await compile_note(text, mission.scenario, self._llm)
             if _waits_for(mission, note):
-                mission.propose_guidance(compiled.guidance, self._llm.notes_model, compiled.doubts)
+                mission.propose_guidance(compiled.guidance, self._llm.notes_model, (*unclear, *compiled.doubts))
                 self._on_change(mission.mission_id)
             return
         except (BadOrders, Impossible, NoDecision) as error:

@@ -41,7 +41,7 @@ def snapshot(mission: Mission, decisions: list[RecentDecision], watched: Watched
             "scenario": scenario.model_dump(include=_SHOWN),
             "pipeline": scenario.pipeline if scenario.layout != "uniform" else (),
             "trajectories": _curves(scenario),
-            "places": _places(mission),
+            "places": np.round(mission.places, 1).tolist(),
             "names": mission.spec.names,
             "map": mission.spec.map or (),
             "decisions": [decision.summary() for decision in decisions],
@@ -129,14 +129,6 @@ def _uav(mission: Mission, watched: Watched, uav: int) -> dict[str, Any]:
         "height_m": report and report.height_m,
         "heard_s": None if report is None else round(time.monotonic() - report.at, 1),
     }
-
-
-def _places(mission: Mission) -> list[Any]:
-    """The sensors' positions, of a surveyed world before the first report too."""
-    places, sites = mission.belief.places, mission.scenario.sites
-    if mission.scenario.layout == "surveyed":
-        places = np.where(np.isnan(places), np.array(sites), places)
-    return np.round(places, 1).tolist()  # type: ignore[no-any-return]
 
 
 def _guidance(mission: Mission) -> dict[str, Any]:

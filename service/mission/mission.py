@@ -7,8 +7,11 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from service.config.settings import Settings
 from service.errors import Refused
+from service.guidance.named_places import NamedPlaces
 from service.guidance.operator_guidance import OperatorGuidance
 from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner
@@ -41,6 +44,7 @@ from shared.wire.missions import VisitDeadline
 from shared.wire.readings import ReadingResult, SensorReading
 from shared.wire.schemas import Belief, Features, MissionSpec, Mode, Outcome, UavState
 from shared.world.actions import Action
+from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario, scenario_named
 
 log = logging.getLogger(__name__)
@@ -262,6 +266,19 @@ class Mission:
         self.guidance.load_state_dict(state)
         if self.planner is not None:
             self.planner.follow(self.guidance.confirmed)
+
+    @property
+    def places(self) -> FloatArray:
+        """The sensors' positions, ``(J, 2)``, of a surveyed world before the first report too; NaN: unknown."""
+        if self.scenario.layout != "surveyed":
+            return self.belief.places
+        return np.where(np.isnan(self.belief.places), np.array(self.scenario.sites), self.belief.places)
+
+    @property
+    def named_places(self) -> NamedPlaces:
+        """What the operator's note may name."""
+        line = self.scenario.pipeline if self.scenario.layout != "uniform" else ()
+        return NamedPlaces(self.spec.names, self.spec.map or (), self.places, line)
 
     def deadlines(self) -> list[VisitDeadline]:
         """The deadlines of the operator's visit orders, met and missed, in the completed steps."""

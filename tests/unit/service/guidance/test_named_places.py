@@ -1,0 +1,85 @@
+"""The user's names in a note become sensors' IDs; what is unclear stays, with a doubt that quotes it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.guidance.named_places import NamedPlaces
+from shared.wire.names import MapShape, Names
+from simulator.sites.files.world_folder import site_from_folder
+from tests.support.world_folders import EXAMPLE
+
+SQUARE = [(1000.0, 2000.0), (2000.0, 2000.0), (2000.0, 2500.0), (1000.0, 2500.0)]
+WEST, EAST = [(0.0, 1850.0), (600.0, 2000.0), (1150.0, 2340.0)], [(5250.0, 3380.0), (5800.0, 3840.0)]
+
+
+@pytest.fixture(scope="module")
+def places() -> NamedPlaces:
+    """The example's sensors, an area of three of them, and two sections beside the whole line."""
+    site = site_from_folder(EXAMPLE)
+    shapes = [
+        *site.map,
+        MapShape(kind="area", name="The Village", points=SQUARE),
+        MapShape(kind="line", name="east end", points=EAST),
+        MapShape(kind="fence", name="border", points=SQUARE),
+    ]
+    return NamedPlaces(site.names, shapes, np.array(site.scenario.sites), site.scenario.pipeline)
+
+
+@pytest.mark.parametrize(
+    ("note", "read"),
+    [
+        ("Leak at kp-1.58: visit it every third step.", "Leak at sensor 3: visit it every third step."),
+        ("KP-1.58, then sensor kp-0.10.", "sensor 3, then sensor 0."),
+        ("near kilometre 3 every 2 steps", "near sensor 6 every 2 steps"),
+        ("leak at km 1.6", "leak at sensor 3"),
+        ("Visit the village often.", "Visit sensors 2, 3 and 4 often."),
+        ("no leak at the east end", "no leak at the sensors 12 and 13"),
+        # More sensors than an order can mean, a fence, a speed.
+        ("walk the trunk line, keep within the border, at 5 km/h", None),
+        ("Visit sensor 4 every third step.", None),
+    ],
+)
+def test_names_areas_sections_and_kilometres_become_ids(places: NamedPlaces, note: str, read: str | None) -> None:
+    assert places.in_ids(note) == (read or note, [])
+
+
+@pytest.mark.parametrize(
+    ("note", "read", "doubt"),
+    [
+        ("kp-1.5 leaks", "kp-1.5 leaks", "“kp-1.5” is no name of this mission."),
+        ("leak at km 9", "leak at sensor 13", "“km 9” is read as sensor 13, the nearest, 2,472 m away"),
+    ],
+)
+def test_what_is_unclear_is_quoted(places: NamedPlaces, note: str, read: str, doubt: str) -> None:
+    found, doubts = places.in_ids(note)
+    assert found == read
+    assert len(doubts) == 1 and doubts[0].startswith(doubt)
+
+
+def test_a_name_of_two_sensors_stays_and_a_number_is_an_id() -> None:
+    names = Names(sensors=["pump", "Pump", "7", None, "step"])
+    places = NamedPlaces(names, [], np.full((5, 2), np.nan), [])
+    assert places.in_ids("Pump leaks") == (
+        "Pump leaks",
+        ["“Pump” is a name of sensors 0 and 1: write the ID of the one that you mean."],
+    )
+    assert places.in_ids("visit sensor 7 every step") == (
+        "visit sensor 7 every step",
+        ["“sensor 7” is read as the ID 7; the sensor named 7 is sensor 2."],
+    )
+    text, doubts = places.in_ids("near km 3")
+    assert text == "near km 3" and doubts[0].startswith("“km 3” is unknown: this mission has no line")
+
+
+def test_without_names_a_note_stays_as_it_is() -> None:
+    places = NamedPlaces(None, [], np.zeros((3, 2)), [(0.0, 0.0), (1000.0, 0.0)])
+    assert places.in_ids("Sensor 1 leaks: visit it every 3 steps.") == ("Sensor 1 leaks: visit it every 3 steps.", [])
+
+
+def test_sections_share_the_sensors_between_them() -> None:
+    shapes = [MapShape(kind="line", name=name, points=at) for name, at in (("west", WEST), ("east", EAST))]
+    site = site_from_folder(EXAMPLE)
+    places = NamedPlaces(None, shapes, np.array(site.scenario.sites), ())
+    assert places.in_ids("west, east")[0] == "sensors 0, 1 and 2, sensors 12 and 13"
