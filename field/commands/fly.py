@@ -246,5 +246,5 @@ def conclude(flown: RealFlight, job: FieldJob, command: str, console: Console) -
         warnings=flown.warnings,
         simulated_lost=job.radio.lost if isinstance(job.radio, SimulatedRadio) else None,
     )
-    summary = summarise(facts, flown.decisions, tallies).model_copy(update={"real_uavs": real})
+    summary = summarise(facts, flown.decisions, tallies).model_copy(update={"real_uavs": real, "names": job.site.names})
     write_results(job.out, summary, flown, tallies, console)

@@ -22,7 +22,6 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from service.guidance.lettered_orders import STATIC, NoteReading, grammar, meaning
-from service.guidance.named_places import NamedPlaces
 from service.guidance.note_numbers import LetteredNote
 from service.guidance.note_orders import INSTRUCTION, BadOrders, parse_orders, similar_examples
 from service.guidance.operator_guidance import OperatorGuidance
@@ -121,9 +120,8 @@ class NoteOwner(Protocol):
     scenario: Scenario
     guidance: OperatorGuidance
 
-    @property
-    def named_places(self) -> NamedPlaces:
-        """What a note may name."""
+    def in_ids(self, note: str) -> tuple[str, list[str]]:
+        """The note with sensors' IDs for the user's names, and doubts."""
         ...
 
     def propose_guidance(self, guidance: Guidance, model: str | None, doubts: Sequence[str] = ()) -> None:
@@ -176,7 +174,7 @@ class NoteCompiler:
                 await self._wait_for_llm()
                 if not _waits_for(mission, note):
                     return
-                text, unclear = await asyncio.to_thread(lambda: mission.named_places.in_ids(note))
+                text, unclear = await asyncio.to_thread(mission.in_ids, note)
                 compiled = await compile_note(text, mission.scenario, self._llm)
             if _waits_for(mission, note):
                 mission.propose_guidance(compiled.guidance, self._llm.notes_model, (*unclear, *compiled.doubts))

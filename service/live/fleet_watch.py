@@ -26,11 +26,11 @@ _ENDED_S, _SILENT_S = 600.0, 30.0
 
 @dataclass(slots=True)
 class UavReport:
-    """A UAV's newest report: its monotonic time, s, and the newest percent of its battery and height, if reported."""
+    """A UAV's newest report: its monotonic time, s, and what it said of the UAV's battery, percent, and height."""
 
     at: float
-    battery: float | None = None
-    height_m: float | None = None
+    battery: float | None
+    height_m: float | None
 
 
 @dataclass(slots=True)
@@ -53,15 +53,6 @@ class Watched:
     uavs: dict[int, UavReport] = field(default_factory=dict)
     began: tuple[int, float] = (-2, 0.0)
     step_took_s: float | None = None
-
-    def take(self, uav: UavState, step: int) -> None:
-        """Take a report's time, and what it says of the UAV itself."""
-        now, known = time.monotonic(), self.uavs.get(uav.uav_id, UavReport(0.0))
-        battery = known.battery if uav.battery_percent is None else uav.battery_percent
-        self.uavs[uav.uav_id] = UavReport(now, battery, known.height_m if uav.height_m is None else uav.height_m)
-        if step > self.began[0]:
-            self.step_took_s = round(now - self.began[1], 3) if step == self.began[0] + 1 else self.step_took_s
-            self.began = step, now
 
     @property
     def batteries(self) -> dict[int, float]:
@@ -87,7 +78,11 @@ class FleetWatch:
         """Record an answered report, and the belief after it."""
         watched = self.of(mission.mission_id)
         watched.decided_at = time.monotonic()
-        watched.take(uav, step)
+        now = time.monotonic()
+        watched.uavs[uav.uav_id] = UavReport(now, uav.battery_percent, uav.height_m)
+        if step > watched.began[0]:
+            watched.step_took_s = now - watched.began[1] if step == watched.began[0] + 1 else watched.step_took_s
+            watched.began = step, now
         if step not in watched.full:
             watched.full[step] = round(float(_overflowed(mission.belief, step, mission.scenario).sum()), 3)
         self._hear(watched, mission, uav, step)

@@ -10,6 +10,7 @@ from service.live.alarms import alarms
 from service.live.fleet_watch import Watched
 from service.live.recent_decisions import RecentDecision
 from service.mission.mission import Mission
+from shared.wire.names import with_names
 from shared.world.scenario import Scenario
 from shared.world.trajectory import trajectories
 from shared.world.urgency import urgency
@@ -133,9 +134,13 @@ def _uav(mission: Mission, watched: Watched, uav: int) -> dict[str, Any]:
 
 def _guidance(mission: Mission) -> dict[str, Any]:
     """The operator's note, the guidance from it, and each order for a sensor with its deadline."""
-    visits = mission.records.visits
+    visits, names = mission.records.visits, mission.spec.names
+    report = mission.guidance.report(mission.mission_id).model_dump(exclude={"mission_id"})
+    words = {key: [with_names(one, names) for one in report[key]] for key in ("begins", "ends", "begun", "ended")}
+    words |= {key: report[key] and with_names(report[key], names) for key in ("in_words", "obeyed_in_words")}
     return {
-        **mission.guidance.report(mission.mission_id).model_dump(exclude={"mission_id"}),
+        **report,
+        **words,
         "orders": [
             {
                 "sensor_id": wish.sensor_id,

@@ -11,7 +11,7 @@ import numpy as np
 
 from service.config.settings import Settings
 from service.errors import Refused
-from service.guidance.named_places import NamedPlaces
+from service.guidance.named_places import in_ids
 from service.guidance.operator_guidance import OperatorGuidance
 from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner
@@ -274,11 +274,10 @@ class Mission:
             return self.belief.places
         return np.where(np.isnan(self.belief.places), np.array(self.scenario.sites), self.belief.places)
 
-    @property
-    def named_places(self) -> NamedPlaces:
-        """What the operator's note may name."""
+    def in_ids(self, note: str) -> tuple[str, list[str]]:
+        """The note with sensors' IDs for the user's names, and doubts, as :func:`in_ids`."""
         line = self.scenario.pipeline if self.scenario.layout != "uniform" else ()
-        return NamedPlaces(self.spec.names, self.spec.map or (), self.places, line)
+        return in_ids(note, self.spec.names, self.spec.map or (), self.places, line)
 
     def deadlines(self) -> list[VisitDeadline]:
         """The deadlines of the operator's visit orders, met and missed, in the completed steps."""

@@ -1,5 +1,6 @@
 """The user's own names of sensors and UAVs, and the lines and areas of the user's own map."""
 
+import re
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
@@ -7,7 +8,7 @@ from pydantic import AfterValidator, Field
 from shared.wire.strict_models import Received, one_paragraph
 from shared.world.scenario import MAX_SENSORS, Waypoint
 
-MAX_NAME, MAX_SHAPES, MAX_POINTS = 64, 300, 10_000
+MAX_NAME, MAX_SHAPES = 64, 300
 
 Name = Annotated[str, Field(max_length=MAX_NAME), AfterValidator(one_paragraph)]
 
@@ -17,10 +18,6 @@ class Names(Received):
 
     sensors: list[Name | None] = Field(default_factory=list, max_length=MAX_SENSORS, fail_fast=True)
     uavs: list[Name | None] = Field(default_factory=list, max_length=100, fail_fast=True)
-
-    def sensor(self, sensor_id: int) -> str | None:
-        """The sensor's name, if it has one."""
-        return self.sensors[sensor_id] if sensor_id < len(self.sensors) else None
 
 
 class MapShape(Received):
@@ -33,10 +30,16 @@ class MapShape(Received):
     )
 
 
-def _few_points(shapes: list[MapShape]) -> list[MapShape]:
-    if (count := sum(len(shape.points) for shape in shapes)) > MAX_POINTS:
-        raise ValueError(f"{count:,} points in all, at most {MAX_POINTS:,}: simplify the map")
-    return shapes
+# A request's size bounds the points of all shapes together.
+MapShapes = Annotated[list[MapShape], Field(max_length=MAX_SHAPES, fail_fast=True)]
 
 
-MapShapes = Annotated[list[MapShape], Field(max_length=MAX_SHAPES, fail_fast=True), AfterValidator(_few_points)]
+def with_names(text: str, names: Names | None) -> str:
+    """A text with the user's name after each ``sensor 4`` and ``UAV 1`` that has one."""
+
+    def named(found: re.Match[str]) -> str:
+        listed = () if names is None else names.uavs if found[1] == "UAV" else names.sensors
+        name = listed[number] if (number := int(found[2])) < len(listed) else None
+        return found[0] if name is None else f"{found[0]} ({name})"
+
+    return re.sub(r"\b(UAV|[Ss]ensor) (\d{1,4})\b", named, text)

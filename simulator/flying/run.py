@@ -251,7 +251,7 @@ def _write_results(
         deadline_ms=job.deadline_ms,
         command=job.command,
     )
-    flown = summarise(facts, flight.decisions, tallies).model_copy(update=extra)
+    flown = summarise(facts, flight.decisions, tallies).model_copy(update={"names": job.site.names, **extra})
     summary = _with_bound(job, flight, flown, console)
     write_results(job.out, summary, flight, tallies, console)
     return INTERRUPTED if flight.interrupted else 0

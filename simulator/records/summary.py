@@ -7,6 +7,7 @@ from typing import Protocol
 
 from pydantic import Field
 
+from shared.wire.names import Names
 from shared.wire.schemas import Tokens, Uplink
 from simulator.records.decision import Decision, queried_llm
 from simulator.records.operator import OperatorRecord
@@ -111,7 +112,7 @@ class Summary(FlightFacts):
     ``guided``. ``without_llm`` is the packets that the same edge lost in the same world in mode ``policy``, ``null``
     where that was not flown. ``bound`` is ``null`` where ``bound_missing`` says why. ``operator`` is ``null`` without
     a note and orders. ``real_uavs`` is left out of a simulated mission; with it, losses are those that beacons
-    reported, and ``uavs`` are those of one command.
+    reported, and ``uavs`` are those of one command. ``names`` are the user's, of a world that has any.
     """
 
     decisions: int
@@ -133,6 +134,7 @@ class Summary(FlightFacts):
     bound_missing: str | None = None
     operator: OperatorRecord | None = None
     real_uavs: RealUavs | None = Field(None, exclude_if=lambda value: value is None)
+    names: Names | None = Field(None, exclude_if=lambda value: value is None)
 
 
 class Tally(Protocol):

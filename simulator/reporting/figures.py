@@ -259,8 +259,8 @@ def tokens_per_step(decisions: Sequence[Decision]) -> PaperFigure:
     return drawn
 
 
-def visits(decisions: Sequence[Decision], sensors: int) -> PaperFigure:
-    """Visits of each sensor as stacked bars: successful and failed ones."""
+def visits(decisions: Sequence[Decision], sensors: int, names: Sequence[str | None] = ()) -> PaperFigure:
+    """Visits of each sensor, with its name if it has one, as stacked bars: successful and failed ones."""
     served = np.array(visits_per_sensor(decisions, sensors))
     tried = np.bincount([d.sensor_id for d in decisions], minlength=sensors)[:sensors]
     with paper_figure("visits", 2.2, (1, 1)) as (drawn, (axes,)):
@@ -272,6 +272,10 @@ def visits(decisions: Sequence[Decision], sensors: int) -> PaperFigure:
         axes.axhline(served.mean(), color=INK, linewidth=1, linestyle=":", label="mean served")
         if sensors <= 20:
             axes.set_xticks(at)
+        if sensors <= 20 and any(names):
+            labels = [(name or str(sensor))[:12] for sensor, name in enumerate(names)]
+            # A dollar sign of a name is no mathematics.
+            axes.set_xticklabels(labels, rotation=90, parse_math=False)
         axes.set_xlabel("sensor")
         axes.set_ylabel("visits")
         plain(axes)

@@ -13,6 +13,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from shared.wire.names import Names, with_names
 from shared.world.scenario import Scenario
 from shared.world.trajectory import trajectories
 from simulator.records.decision import Decision
@@ -133,7 +134,7 @@ def drawings(
     """
     drawn = {
         "losses": figures.losses(tallies, policy_labels(summary)),
-        "visits": figures.visits(decisions, scenario.sensors),
+        "visits": figures.visits(decisions, scenario.sensors, (summary.names or Names()).sensors),
     }
     if summary.policy == "edge":
         drawn["map"] = figures.latency_map(scenario, sensor_xy, decisions)
@@ -157,6 +158,10 @@ def render_report(
     pages.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
     pages.filters["number"] = number
     pages.filters["percent"] = percent
+    names = summary.names or Names()
+    pages.filters["sensor"] = lambda id_: dict(enumerate(names.sensors)).get(id_) or id_
+    pages.filters["uav"] = lambda id_: dict(enumerate(names.uavs)).get(id_) or id_
+    pages.filters["named"] = lambda text: with_names(text, names)
     labels = policy_labels(summary)
     return pages.get_template("report.html.j2").render(
         s=summary,
@@ -197,6 +202,8 @@ def write_report(
     drawn = drawings(summary, scenario, decisions, tallies, sensor_xy)
     instants = track.until(summary.steps_flown)
     played = playback(scenario, sensor_xy, decisions, instants, track.stride)
+    if played is not None:
+        played.mission["names"] = (summary.names or Names()).model_dump()
     path.write_text(render_report(summary, scenario, decisions, drawn, played), encoding="utf-8")
     folder = path.parent / FIGURES
     folder.mkdir(exist_ok=True)

@@ -20,6 +20,9 @@
   const draw = (name, attributes, ...children) => filled(document.createElementNS(map.namespaceURI, name), attributes, children);
   const make = (name, attributes, ...children) => filled(document.createElement(name), attributes, children);
   const packets = (count) => `${count.toLocaleString("en")} packet${count === 1 ? "" : "s"}`;
+  const sensorName = (id) => mission.names?.sensors[id] ?? `S${id}`;
+  const uavName = (id) => mission.names?.uavs[id] ?? `U${id}`;
+  const short = (name) => (name.length > 12 ? `${name.slice(0, 11)}…` : name);
   const total = (numbers) => numbers.reduce((sum, one) => sum + one, 0);
 
   const points = [...mission.trajectories.flat(), ...mission.pipeline, ...sensors];
@@ -36,7 +39,7 @@
   const discs = sensors.map((point, id) => {
     const disc = draw("circle", { class: "queue", r: 0 });
     const group = draw("g", { class: "sensor" }, draw("circle", { class: "body", r: radius }), disc);
-    if (sensors.length <= FEW) group.append(draw("text", { y: -radius - 10 }, `S${id}`));
+    if (sensors.length <= FEW) group.append(draw("text", { y: -radius - 10 }, short(sensorName(id))));
     move(group, point);
     return { group, disc };
   });
@@ -50,7 +53,7 @@
   function craft(id) {
     if (!crafts.has(id)) {
       const body = draw("path", { d: "M0-26L23 18H-23z" });
-      const label = draw("text", {}, `U${id}`);
+      const label = draw("text", {}, short(uavName(id)));
       const group = draw("g", { class: "uav" }, body, label);
       const link = draw("line", {});
       fleet.append(group);
@@ -81,7 +84,7 @@
     });
     const shown = sensors.map((_, id) => id);
     if (sensors.length > FEW) shown.sort((a, b) => frame.queue[b] - frame.queue[a] || a - b).splice(FEW);
-    const rows = shown.map((id) => [`S${id}`, `${frame.queue[id]} of ${mission.capacity}`, `${frame.battery[id]} %`, frame.lost[id]]);
+    const rows = shown.map((id) => [sensorName(id), `${frame.queue[id]} of ${mission.capacity}`, `${frame.battery[id]} %`, frame.lost[id]]);
     fill("playback-sensors", rows);
   }
 
@@ -100,7 +103,7 @@
       filled(link, { x1: from[0], y1: from[1], x2: to[0], y2: to[1], class: decision[4] ? "failed" : "served" }, []);
     }
     const rows = frame.decisions.map(([id, sensor, velocity, source, failed, collected, , cost]) =>
-      [`U${id}`, `S${sensor}`, velocity, source, failed ? "failed" : collected, cost.toFixed(2)]);
+      [uavName(id), sensorName(sensor), velocity, source, failed ? "failed" : collected, cost.toFixed(2)]);
     fill("playback-uavs", rows);
     at("playback-decisions").hidden = rows.length === 0;
   }

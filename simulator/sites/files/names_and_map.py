@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shared.wire.names import MAX_POINTS, MAX_SHAPES, MapShape, Names
+from shared.wire.names import MAX_SHAPES, MapShape, Names
 from shared.world.channel import FloatArray
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence
@@ -14,7 +14,7 @@ from simulator.sites.files.survey import Survey
 from simulator.sites.pictured_line import simplified
 from simulator.sites.projection import Frame
 
-_CORNERS, _MOST_POINTS, _FARTHEST_M = 48, 1000, 2e6
+_CORNERS, _MOST_POINTS, _MOST_ALTOGETHER, _FARTHEST_M = 48, 1000, 10_000, 2e6
 
 
 def names_and_map(
@@ -27,7 +27,7 @@ def names_and_map(
     """
     if (count := len(survey.drawn) + len(fences)) > MAX_SHAPES:
         raise UsageError(f"{path}: {count:,} lines and areas with the fences, at most {MAX_SHAPES}; join some")
-    most = min(_MOST_POINTS, MAX_POINTS // max(1, count))
+    most = min(_MOST_POINTS, _MOST_ALTOGETHER // max(1, count))
     shapes = []
     for kind, name, points in survey.drawn:
         line = frame.metres(points)

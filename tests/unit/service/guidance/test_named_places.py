@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
-from service.guidance.named_places import NamedPlaces
+from service.guidance.named_places import in_ids
 from shared.wire.names import MapShape, Names
 from simulator.sites.files.world_folder import site_from_folder
 from tests.support.world_folders import EXAMPLE
@@ -14,8 +16,11 @@ SQUARE = [(1000.0, 2000.0), (2000.0, 2000.0), (2000.0, 2500.0), (1000.0, 2500.0)
 WEST, EAST = [(0.0, 1850.0), (600.0, 2000.0), (1150.0, 2340.0)], [(5250.0, 3380.0), (5800.0, 3840.0)]
 
 
+Read = Callable[[str], tuple[str, list[str]]]
+
+
 @pytest.fixture(scope="module")
-def places() -> NamedPlaces:
+def read_note() -> Read:
     """The example's sensors, an area of three of them, and two sections beside the whole line."""
     site = site_from_folder(EXAMPLE)
     shapes = [
@@ -24,7 +29,8 @@ def places() -> NamedPlaces:
         MapShape(kind="line", name="east end", points=EAST),
         MapShape(kind="fence", name="border", points=SQUARE),
     ]
-    return NamedPlaces(site.names, shapes, np.array(site.scenario.sites), site.scenario.pipeline)
+    sites = np.array(site.scenario.sites)
+    return lambda note: in_ids(note, site.names, shapes, sites, site.scenario.pipeline)
 
 
 @pytest.mark.parametrize(
@@ -41,8 +47,8 @@ def places() -> NamedPlaces:
         ("Visit sensor 4 every third step.", None),
     ],
 )
-def test_names_areas_sections_and_kilometres_become_ids(places: NamedPlaces, note: str, read: str | None) -> None:
-    assert places.in_ids(note) == (read or note, [])
+def test_names_areas_sections_and_kilometres_become_ids(read_note: Read, note: str, read: str | None) -> None:
+    assert read_note(note) == (read or note, [])
 
 
 @pytest.mark.parametrize(
@@ -52,34 +58,37 @@ def test_names_areas_sections_and_kilometres_become_ids(places: NamedPlaces, not
         ("leak at km 9", "leak at sensor 13", "“km 9” is read as sensor 13, the nearest, 2,472 m away"),
     ],
 )
-def test_what_is_unclear_is_quoted(places: NamedPlaces, note: str, read: str, doubt: str) -> None:
-    found, doubts = places.in_ids(note)
+def test_what_is_unclear_is_quoted(read_note: Read, note: str, read: str, doubt: str) -> None:
+    found, doubts = read_note(note)
     assert found == read
     assert len(doubts) == 1 and doubts[0].startswith(doubt)
 
 
 def test_a_name_of_two_sensors_stays_and_a_number_is_an_id() -> None:
     names = Names(sensors=["pump", "Pump", "7", None, "step"])
-    places = NamedPlaces(names, [], np.full((5, 2), np.nan), [])
-    assert places.in_ids("Pump leaks") == (
+
+    def read_note(note: str) -> tuple[str, list[str]]:
+        return in_ids(note, names, [], np.full((5, 2), np.nan), [])
+
+    assert read_note("Pump leaks") == (
         "Pump leaks",
         ["“Pump” is a name of sensors 0 and 1: write the ID of the one that you mean."],
     )
-    assert places.in_ids("visit sensor 7 every step") == (
+    assert read_note("visit sensor 7 every step") == (
         "visit sensor 7 every step",
-        ["“sensor 7” is read as the ID 7; the sensor named 7 is sensor 2."],
+        ["“sensor 7” is read as ID 7; the one named 7 is sensor 2."],
     )
-    text, doubts = places.in_ids("near km 3")
+    text, doubts = read_note("near km 3")
     assert text == "near km 3" and doubts[0].startswith("“km 3” is unknown: this mission has no line")
 
 
 def test_without_names_a_note_stays_as_it_is() -> None:
-    places = NamedPlaces(None, [], np.zeros((3, 2)), [(0.0, 0.0), (1000.0, 0.0)])
-    assert places.in_ids("Sensor 1 leaks: visit it every 3 steps.") == ("Sensor 1 leaks: visit it every 3 steps.", [])
+    note, line = "Sensor 1 leaks: visit it every 3 steps.", [(0.0, 0.0), (1000.0, 0.0)]
+    assert in_ids(note, None, [], np.zeros((3, 2)), line) == (note, [])
 
 
 def test_sections_share_the_sensors_between_them() -> None:
     shapes = [MapShape(kind="line", name=name, points=at) for name, at in (("west", WEST), ("east", EAST))]
     site = site_from_folder(EXAMPLE)
-    places = NamedPlaces(None, shapes, np.array(site.scenario.sites), ())
-    assert places.in_ids("west, east")[0] == "sensors 0, 1 and 2, sensors 12 and 13"
+    sites = np.array(site.scenario.sites)
+    assert in_ids("west, east", None, shapes, sites, ())[0] == "sensors 0, 1 and 2, sensors 12 and 13"
