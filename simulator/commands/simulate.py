@@ -56,9 +56,9 @@ class Simulate(WorldOptions):
 
       aicvds simulate --policy fullest.py:FullestInRange --against edge:value --against mpc --sensors 20 --uavs 5
 
-    If the edge is lost during the flight, the UAVs collect from the longest queue in reach at their last velocities, and
-    before the next step wait up to --reconnect-s seconds for the edge to come back. Steps are not real time, so without this pause the
-    mission would end first.
+    If the edge is lost during the flight, the UAVs collect from the longest queue in reach at their last velocities,
+    and before the next step wait up to --reconnect-s seconds for the edge to come back. Steps are not real time, so
+    without this pause the mission would end first.
 
     Ctrl-C stops the flight and still writes the report of the steps flown. The environment variable AICVDS_API_KEY has
     the key for an edge that needs one. Exit code: 0 flown, 1 no edge, 2 bad use, 130 interrupted.
