@@ -6,7 +6,8 @@ import time
 from typing import Literal
 
 from shared.client.edge_client import EdgeClient
-from shared.planning.orders import Guidance, GuidanceAnswer, GuidanceState
+from shared.planning.guidance_messages import GuidanceAnswer, GuidanceState
+from shared.planning.orders import Guidance
 from simulator.records.record import Record
 
 _WAIT_S = 300.0

@@ -14,7 +14,8 @@ from starlette.exceptions import HTTPException
 
 from service.errors import Misdirected, Refused, Unavailable
 from shared.kit.validation_messages import problem_of
-from shared.planning.orders import Guidance, GuidanceAnswer, SensorWish
+from shared.planning.guidance_messages import GuidanceAnswer
+from shared.planning.orders import End, Guidance, SensorWish
 from shared.wire.problem import Problem
 from shared.wire.readings import ReadingsRequest, SensorReading
 from shared.wire.schemas import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, PromptStyle, SensorColumns
@@ -30,7 +31,7 @@ CONTENT_TYPE = "application/problem+json"
 _MOST_NAME = 80
 _REQUESTS = (
     *(BatchRequest, DecideRequest, FeedbackRequest, SensorColumns),
-    *(MissionSpec, PromptStyle, Scenario, GuidanceAnswer, Guidance, SensorWish),
+    *(MissionSpec, PromptStyle, Scenario, GuidanceAnswer, Guidance, SensorWish, End),
     *(ReadingsRequest, SensorReading),
 )
 # The names of all request fields, for suggestions for unknown names.

@@ -21,7 +21,7 @@ from service.live.alarms import KINDS
 from service.llm.server_pool import ServerPool
 from service.mission.mission_status import status_of
 from service.observability.metrics import Metrics
-from shared.planning.orders import GuidanceAnswer, GuidanceStatus
+from shared.planning.guidance_messages import GuidanceAnswer, GuidanceStatus
 from shared.wire.missions import MissionAttention, MissionStatus
 from shared.wire.readings import ReadingsRequest, ReadingsResponse
 from shared.wire.schemas import (

@@ -116,6 +116,7 @@ class Engine:
             # All outcomes are applied before the first decision, so that none is lost while the UAVs wait for the LLM.
             for outcome in (uav.outcome for uav in reports.uavs if uav.outcome is not None):
                 self._feedback.apply_reported(mission, outcome)
+            mission.end_orders(request.step)
             return await self._batches.decide(mission, reports, watch, deadline)
 
         return await self._respond(mission, request, key, make, deadline)
@@ -204,6 +205,7 @@ class Engine:
         self._feedback.catch_up(mission)
         if request.outcome is not None:
             self._feedback.apply_reported(mission, request.outcome)
+        mission.end_orders(request.step)
         attempt = mission.observe(request, request.step)
         deadline_ms, mine = request.deadline_ms or self._settings.deadline_ms, Deadline(deadline.at - RESERVE_S)
         plan = self.pipeline.begin_plan(mission, [request.uav_id], request.step, mine)

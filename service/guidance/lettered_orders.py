@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from service.guidance.note_numbers import LetteredNote, Number
-from service.guidance.note_orders import BadOrders, guidance_of
-from shared.planning.orders import Guidance
+from service.guidance.note_orders import BadOrders
+from shared.planning.orders import End, Guidance
 from shared.world.scenario import Scenario
 
 STATIC = "Orders of a note."
@@ -75,9 +75,8 @@ class _Orders:
     def __init__(self, numbers: Mapping[str, Number], scenario: Scenario) -> None:
         self._numbers = numbers
         self._scenario = scenario
-        self._wishes: dict[int, dict[str, float]] = {}
-        self._limits: dict[str, int] = {}
-        self._forbidden: list[int] = []
+        self._values: dict[str, float] = {}
+        self._end: End | None = None
         self._others = False
         self.doubts: list[str] = []
 
@@ -86,14 +85,14 @@ class _Orders:
         kind, *words = order.split(" ")
         writers: dict[str, Callable[[list[str]], object]] = {
             "visit": self._visit,
-            "weigh": lambda words: self._wish(words[:-1], "weight", self._plain(words[-1], "weight")),
+            "weigh": lambda words: self._wish("weight", words[:-1], self._plain(words[-1], "weight")),
             "ignore": self._ignore,
-            "max": lambda words: self._limit("max_velocity", self._velocity(words, math.floor)),
-            "min": lambda words: self._limit("min_velocity", self._velocity(words, math.ceil)),
-            "avoid": lambda words: self._forbidden.extend(self._velocity([word], _whole) for word in words),
-            MOVE: lambda _: self._forbidden.append(0),
-            "until": self._end,
-            "for": self._end,
+            "max": lambda words: self._order("max_velocity", self._velocity(words, math.floor)),
+            "min": lambda words: self._order("min_velocity", self._velocity(words, math.ceil)),
+            "avoid": self._avoid,
+            MOVE: lambda _: self._order("avoid:0", 0),
+            "until": self._until,
+            "for": lambda words: self._ended(End(steps=self._period(words[0]))),
             UNCLEAR: lambda _: self.doubts.append("A part of the note is unclear, and is in no order."),
         }
         write = writers.get(kind)
@@ -105,34 +104,45 @@ class _Orders:
         """The orders together; raises :class:`BadOrders`."""
         if self._others:
             for sensor in range(self._scenario.sensors):
-                self._wishes.setdefault(sensor, {"weight": 0.0})
-        return guidance_of(self._wishes, self._limits, sorted(set(self._forbidden)))
+                if not {f"visit:{sensor}", f"weight:{sensor}"} & self._values.keys():
+                    self._values[f"weight:{sensor}"] = 0.0
+        return Guidance.of(self._values, {} if self._end is None else dict.fromkeys(self._values, self._end))
 
     def _visit(self, words: list[str]) -> None:
         if words[-1] == "always":
-            return self._wish(words[:-1], "visit_every", 1)
+            return self._wish("visit", words[:-1], 1)
         if len(words) < 3 or words[-2] != "every":
             raise BadOrders("a visit has no period")
-        self._wish(words[:-2], "visit_every", self._period(words[-1]))
-        return None
+        return self._wish("visit", words[:-2], self._period(words[-1]))
 
     def _ignore(self, words: list[str]) -> None:
         if words == [OTHERS]:
             self._others = True
         else:
-            self._wish(words, "weight", 0.0)
+            self._wish("weight", words, 0.0)
 
-    def _end(self, _: list[str]) -> None:
-        self.doubts.append("The note says when the orders end. The edge does not end them by itself.")
+    def _avoid(self, words: list[str]) -> None:
+        for word in words:
+            level = self._velocity([word], _whole)
+            self._order(f"avoid:{level}", level)
 
-    def _wish(self, sensors: list[str], name: str, value: float) -> None:
+    def _until(self, words: list[str]) -> None:
+        number = self._number(words[0])
+        if number.unit not in (None, "steps") or not number.value.is_integer():
+            raise BadOrders(f"{number.value:g} {number.unit or ''} is no step")
+        self._ended(End(step=int(number.value)))
+
+    def _ended(self, end: End) -> None:
+        if self._end is not None:
+            raise BadOrders("the orders end twice")
+        self._end = end
+
+    def _wish(self, kind: str, sensors: list[str], value: float) -> None:
         for sensor in self._sensors(sensors):
-            wish = self._wishes.setdefault(sensor, {})
-            if wish.setdefault(name, value) != value:
-                raise BadOrders(f"{name} of sensor {sensor} is ordered twice")
+            self._order(f"{kind}:{sensor}", value)
 
-    def _limit(self, name: str, value: int) -> None:
-        if self._limits.setdefault(name, value) != value:
+    def _order(self, name: str, value: float) -> None:
+        if self._values.setdefault(name, value) != value:
             raise BadOrders(f"{name} is ordered twice")
 
     def _sensors(self, words: list[str]) -> list[int]:

@@ -10,14 +10,11 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from importlib.resources import files
 
-from pydantic import ValidationError
-
 from service.guidance.note_numbers import CARDINALS, ORDINALS
-from shared.planning.orders import Guidance, SensorWish
+from shared.planning.orders import Guidance
 
 # Worked examples: notes as operators write them, and their orders.
 EXAMPLES: list[tuple[str, str]] = list(
@@ -33,6 +30,13 @@ _EXAMPLES_SHOWN = 8
 
 VISIT, WEIGHT = "visit sensor # every # steps", "sensor # counts # times"
 FASTEST, SLOWEST, FORBIDDEN = "fly at most # m/s", "fly at least # m/s", "do not fly at # m/s"
+_NAMES = {
+    VISIT: "visit:{}",
+    WEIGHT: "weight:{}",
+    FASTEST: "max_velocity",
+    SLOWEST: "min_velocity",
+    FORBIDDEN: "avoid:{}",
+}
 _PATTERNS = {
     words: re.compile(re.escape(words).replace(r"\#", "([0-9]{1,4})"))
     for words in (VISIT, WEIGHT, FASTEST, SLOWEST, FORBIDDEN)
@@ -59,39 +63,20 @@ def parse_orders(text: str, note: str) -> Guidance:
 
     Raises:
         BadOrders: extra text, a repeated order, or a number that occurs more often than in the note.
+        Impossible: a number is out of range.
     """
-    wishes: dict[int, dict[str, int]] = {}
-    limits: dict[str, int] = {}
-    forbidden: list[int] = []
+    values: dict[str, float] = {}
+    sensors: set[int] = set()
     for words, numbers in map(parse_order, _orders_in(text)):
-        if words in (VISIT, WEIGHT):
-            target, value = wishes.setdefault(numbers[0], {}), numbers[1]
-            key = "visit_every" if words == VISIT else "weight"
-        elif words == FORBIDDEN:
-            forbidden.append(numbers[0])
-            continue
-        else:
-            target, value = limits, numbers[0]
-            key = "max_velocity" if words == FASTEST else "min_velocity"
-        if key in target:
-            raise BadOrders(f"{key} is ordered twice")
-        target[key] = value
-    used = Counter([*wishes, *forbidden, *limits.values(), *(v for wish in wishes.values() for v in wish.values())])
+        name = _NAMES[words].format(numbers[0])
+        if name in values:
+            raise BadOrders(f"{name} is ordered twice")
+        values[name] = numbers[-1]
+        sensors |= set(numbers[:-1])
+    used = Counter([*sensors, *map(int, values.values())])
     if invented := used - numbers_in(note):
         raise BadOrders(f"the orders use the number {next(iter(invented))} more often than the note")
-    return guidance_of(wishes, limits, forbidden)
-
-
-def guidance_of(
-    wishes: Mapping[int, Mapping[str, float]], limits: Mapping[str, int], forbidden: Sequence[int]
-) -> Guidance:
-    """The guidance of wishes by sensor, limits of velocity and forbidden velocities; raises :class:`BadOrders`."""
-    try:
-        sensors = [SensorWish.model_validate({"sensor_id": sensor, **wish}) for sensor, wish in wishes.items()]
-        return Guidance.model_validate({"sensors": sensors, **limits, "forbidden_velocities": forbidden})
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise BadOrders(f"{first['loc'][-1] if first['loc'] else 'orders'}: {first['msg']}") from None
+    return Guidance.of(values, {})
 
 
 def similar_examples(note: str, count: int = _EXAMPLES_SHOWN) -> list[tuple[str, str]]:

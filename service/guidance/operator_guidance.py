@@ -1,20 +1,30 @@
 """One mission's operator's guidance: the note, the guidance proposed from it, and the confirmed guidance."""
 
 import hashlib
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Collection, Sequence
+from datetime import UTC, datetime
+from fnmatch import filter as matching
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from service.errors import Conflict, Refused
-from shared.planning.orders import NO_GUIDANCE, Guidance, GuidanceAnswer, GuidanceState, GuidanceStatus, Impossible
+from shared.planning.guidance_messages import GuidanceAnswer, GuidanceState, GuidanceStatus, OrderRecord
+from shared.planning.orders import NO_GUIDANCE, End, Guidance, Impossible
 from shared.world.scenario import Scenario
+
+# Most ended orders in memory.
+_MOST_ENDED = 1000
 
 
 class OperatorGuidance:
     """The life of a note: compiling, then proposed or failed, then confirmed or rejected.
 
     The operator may give a structure at any time, which is confirmed at once. A proposal that an LLM makes afterwards
-    is ignored. A new note begins this life again; the orders that were confirmed before stay until the operator
-    confirms the new ones, or withdraws them; a rejected proposal leaves them as they are.
+    is ignored. A new note begins this life again. New orders are added to those in force, and replace only those that
+    they contradict, unless the operator confirms them as a replacement of all. A note may also withdraw orders.
 
     Attributes:
         confirmed: the guidance that planner and scores follow; empty until the operator confirms one.
@@ -24,6 +34,9 @@ class OperatorGuidance:
     def __init__(self, note: str | None, scenario: Scenario) -> None:
         self.note = note
         self.status: GuidanceState = "none" if note is None else "compiling"
+        self._in_force: dict[str, OrderRecord] = {}
+        self._over: deque[OrderRecord] = deque(maxlen=_MOST_ENDED)
+        self._withdrawn: list[str] = []
         self._begun: list[str] = []
         self._ended: list[str] = []
         self._obey(NO_GUIDANCE)
@@ -34,63 +47,118 @@ class OperatorGuidance:
         self._failure: str | None = None
         self._doubts: list[str] = []
 
-    def propose(self, guidance: Guidance, model: str | None, doubts: Sequence[str] = ()) -> None:
-        """Propose the guidance that an LLM made of the note; until the operator confirms it, only a prompt shows it."""
+    def propose(
+        self, guidance: Guidance, model: str | None, doubts: Sequence[str] = (), withdrawn: Sequence[str] = ()
+    ) -> None:
+        """Propose the guidance that was read in the note; until the operator confirms it, only a prompt shows it.
+
+        Args:
+            withdrawn: patterns of the names of orders in force that the note withdraws.
+        """
         if self.status == "compiling":
             self.status, self._proposed, self._origin, self._model = "proposed", guidance, "llm", model
-            self._doubts = list(doubts)
+            self._doubts, self._withdrawn = list(doubts), list(withdrawn)
 
     def fail(self, reason: str, model: str | None) -> None:
         """Record that the note was not compiled."""
         if self.status == "compiling":
             self.status, self._failure, self._model = "failed", reason, model
 
-    def answer(self, answer: GuidanceAnswer) -> None:
+    def answer(self, answer: GuidanceAnswer, step: int) -> None:
         """Apply the operator's answer, which takes effect with the next decision.
 
+        Args:
+            step: the first step whose decisions all follow it.
+
         Raises:
-            Conflict: there is nothing to confirm or reject, or the guidance is no longer that of the answer's version.
+            Conflict: there is nothing to confirm, reject or withdraw, the fleet cannot follow the proposal any more, or
+                the guidance is no longer that of the answer's version.
             Refused: the fleet cannot follow the operator's structure; the guidance stays as it is.
         """
         if answer.version not in (None, self.version):
             raise Conflict("version", "the guidance has changed since this version: read it again, then answer")
+        replaces = answer.change == "replace"
         if answer.note is not None:
             self.note, self.status = answer.note, "compiling"
             self._proposed = self._origin = self._model = self._failure = None
-            self._doubts = []
+            self._doubts, self._withdrawn = [], []
         elif answer.guidance is not None:
             try:
-                answer.guidance.check(self._scenario)
+                self._change(self._with(answer.guidance, (), replaces, step), step, None)
             except Impossible as error:
                 raise Refused(f"guidance.{error.field}", error.detail) from None
             self._proposed, self._origin, self._failure = answer.guidance, "operator", None
-            self._doubts = []
-            self._confirm(answer.guidance)
+            self._doubts, self._withdrawn, self.status = [], [], "confirmed"
         elif answer.answer == "withdraw" or (answer.answer == "reject" and self.orders and self.status != "proposed"):
-            self._withdraw()
+            self._withdraw(answer.orders, step)
         elif self._proposed is None:
             raise Conflict(
                 "answer", f"guidance is {self.status}: there is nothing to {answer.answer}; give `guidance` of your own"
             )
         elif answer.answer == "confirm":
-            self._confirm(self._proposed)
+            note = self.note if self._origin == "llm" else None
+            try:
+                self._change(self._with(self._proposed, self._withdrawn, replaces, step), step, note)
+            except Impossible as error:
+                raise Conflict("answer", str(error)) from None
+            self.status = "confirmed"
         else:
             self.status = "rejected"
 
-    def _confirm(self, guidance: Guidance) -> None:
-        self.status = "confirmed"
-        self._change(guidance)
+    def expire(self, step: int, visits: NDArray[np.int64]) -> bool:
+        """End the orders whose end has come before the decisions of a step; returns whether there are any.
 
-    def _withdraw(self) -> None:
+        Args:
+            visits: the step of each sensor's last visit that succeeded, by sensor ID; -1 for never.
+        """
+        now = datetime.now(UTC)
+        over = [
+            name
+            for name, end in self.confirmed.ends.items()
+            if (end.step is not None and step >= end.step)
+            or (end.time is not None and now >= end.time)
+            or (end.visited is not None and visits[end.visited] >= self._in_force[name].since_step)
+        ]
+        if over:
+            self._change(self.confirmed.without(over), step, None)
+        return bool(over)
+
+    def _with(self, guidance: Guidance, withdrawn: Sequence[str], replaces: bool, step: int = 0) -> Guidance:
+        """The orders in force after this guidance is given; raises :class:`Impossible`."""
+        guidance.check(self._scenario)
+        for name, end in guidance.ends.items():
+            if end.step is not None and end.step <= step > 0:
+                raise Impossible(f"ends.{name}.step", f"the mission is at step {step} already")
+        kept = NO_GUIDANCE if replaces else self.confirmed.without(self._matching(withdrawn))
+        # An order for some steps is counted from here on.
+        ends = {n: e if e.steps is None else End(step=step + e.steps) for n, e in guidance.ends.items()}
+        return Guidance.of(guidance.values, ends).added_to(kept, self._scenario.max_velocity + 1)
+
+    def _matching(self, patterns: Sequence[str]) -> set[str]:
+        return {name for pattern in patterns for name in matching(self._in_force, pattern)}
+
+    def _withdraw(self, names: Collection[str] | None, step: int) -> None:
+        if unknown := set(names or ()) - self._in_force.keys():
+            raise Conflict("orders", f"no order {min(unknown)} is in force, but {', '.join(self._in_force) or 'none'}")
         # A note that is being read, was not understood or waits for an answer stays as it is.
-        if self.status == "confirmed":
+        left = NO_GUIDANCE if names is None else self.confirmed.without(names)
+        if self.status == "confirmed" and not left:
             self.status = "rejected"
-        self._change(NO_GUIDANCE)
+        self._change(left, step, None)
 
-    def _change(self, guidance: Guidance) -> None:
+    def _change(self, guidance: Guidance, step: int, note: str | None) -> None:
         begun, ended = guidance.beyond(self.confirmed), self.confirmed.beyond(guidance)
         if begun or ended:
             self._begun, self._ended = begun, ended
+        now = datetime.now(UTC).replace(microsecond=0)
+        words = guidance.each_in_words()
+        for name, record in list(self._in_force.items()):
+            if words.get(name) != record.in_words:
+                over = {"until_step": max(step, record.since_step), "until": now}
+                self._over.append(self._in_force.pop(name).model_copy(update=over))
+        for name, order in words.items():
+            if name not in self._in_force:
+                self._in_force[name] = OrderRecord(name=name, in_words=order, note=note, since_step=step, since=now)
         self._obey(guidance)
 
     def _obey(self, guidance: Guidance) -> None:
@@ -111,6 +179,8 @@ class OperatorGuidance:
 
     def report(self, mission_id: str) -> GuidanceStatus:
         """The body of ``GET /missions/{id}/guidance``."""
+        waits = self._proposed if self.status != "confirmed" else None
+        changed = {} if waits is None else self._changes(waits)
         return GuidanceStatus(
             mission_id=mission_id,
             status=self.status,
@@ -122,20 +192,36 @@ class OperatorGuidance:
             model=self._model,
             failure=self._failure,
             doubts=self._doubts,
-            begins=[] if self._proposed is None else self._proposed.beyond(self.confirmed),
-            ends=[] if self._proposed is None else self.confirmed.beyond(self._proposed),
+            **changed,
             begun=self._begun,
             ended=self._ended,
+            orders=[*self._over, *self._in_force.values()],
             version=self.version,
         )
+
+    def _changes(self, proposed: Guidance) -> dict[str, list[str]]:
+        """What a confirmation would change, each order in words."""
+        try:
+            after = self._with(proposed, self._withdrawn, replaces=False)
+        except Impossible:
+            after = proposed
+        ends = self.confirmed.beyond(after)
+        return {
+            "begins": proposed.beyond(self.confirmed),
+            "stays": [order for order in self.confirmed.each_in_words().values() if order not in ends],
+            "ends": ends,
+            "ends_if_replaced": self.confirmed.beyond(proposed),
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Status, proposal and confirmed guidance, as plain values."""
         return {
             "note": self.note,
             "status": self.status,
-            "obeyed": self.confirmed.model_dump(),
-            "understood": None if self._proposed is None else self._proposed.model_dump(),
+            "obeyed": self.confirmed.model_dump(mode="json"),
+            "understood": None if self._proposed is None else self._proposed.model_dump(mode="json"),
+            "withdrawn": self._withdrawn,
+            "orders": [record.model_dump(mode="json") for record in (*self._over, *self._in_force.values())],
             "origin": self._origin,
             "model": self._model,
             "failure": self._failure,
@@ -152,5 +238,8 @@ class OperatorGuidance:
         proposed = state["understood"]
         self._proposed = None if proposed is None else Guidance.model_validate(proposed)
         self._origin, self._model, self._failure = state["origin"], state["model"], state["failure"]
-        self._doubts = state["doubts"]
+        self._doubts, self._withdrawn = state["doubts"], state["withdrawn"]
+        records = [OrderRecord.model_validate(record) for record in state["orders"]]
+        self._over = deque((record for record in records if record.until is not None), maxlen=_MOST_ENDED)
+        self._in_force = {record.name: record for record in records if record.until is None}
         self._begun, self._ended = state["begun"], state["ended"]

@@ -39,7 +39,8 @@ from service.prompting.experiences import Experience, Experiences
 from shared.belief.fleet_belief import FleetBelief
 from shared.belief.gain_measurements import Measured
 from shared.belief.records import Records, take_report
-from shared.planning.orders import Guidance, GuidanceAnswer
+from shared.planning.guidance_messages import GuidanceAnswer
+from shared.planning.orders import Guidance
 from shared.wire.missions import VisitDeadline
 from shared.wire.readings import ReadingResult, SensorReading
 from shared.wire.schemas import Belief, Features, MissionSpec, Mode, Outcome, UavState
@@ -119,12 +120,19 @@ class Mission:
 
     def answer_guidance(self, answer: GuidanceAnswer) -> None:
         """Apply the operator's answer; raises as :meth:`OperatorGuidance.answer`."""
-        self.guidance.answer(answer)
+        self.guidance.answer(answer, self.visit_orders.last + 1)
         self._guidance_changed()
 
-    def propose_guidance(self, guidance: Guidance, model: str | None, doubts: Sequence[str] = ()) -> None:
-        """Propose the guidance that an LLM made of the operator's note."""
-        self.guidance.propose(guidance, model, doubts)
+    def end_orders(self, step: int) -> None:
+        """End the orders whose end has come, before a decision of this step; a replay has the event of it."""
+        if self.guidance.expire(max(step, self.visit_orders.last + 1), self.records.confirmed):
+            self._guidance_changed()
+
+    def propose_guidance(
+        self, guidance: Guidance, model: str | None, doubts: Sequence[str] = (), withdrawn: Sequence[str] = ()
+    ) -> None:
+        """Propose the guidance that was read in the operator's note."""
+        self.guidance.propose(guidance, model, doubts, withdrawn)
         self._guidance_changed()
 
     def fail_guidance(self, reason: str, model: str | None) -> None:

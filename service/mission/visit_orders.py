@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from shared.planning.orders import Guidance
+from shared.planning.orders import Guidance, once
 from shared.planning.visit_deadlines import count_deadlines
 from shared.wire.missions import VisitDeadline
 
@@ -72,7 +72,12 @@ class VisitOrders:
                 order.close(self._final)
 
     def _change(self, guidance: Guidance, since: int) -> None:
-        wanted = {wish.sensor_id: wish.visit_every for wish in guidance.sensors if wish.visit_every is not None}
+        # A single visit has no deadline.
+        wanted = {
+            int(name[6:]): int(value)
+            for name, value in guidance.values.items()
+            if name.startswith("visit:") and not once(name, value, guidance.ends.get(name))
+        }
         for sensor, order in list(self._open.items()):
             if wanted.get(sensor) != order.every:
                 order.until = since

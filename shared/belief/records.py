@@ -23,13 +23,14 @@ class Records:
     Attributes:
         visits: TVR_j, shape ``(J,)``: the step of the latest visit that is confirmed, or still open and presumed to
             succeed; -1 for none.
+        confirmed: the same, without the visits that are still open.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         count = scenario.sensors
         self._capacity = scenario.queue_capacity
         self.visits: NDArray[np.int64] = np.full(count, NEVER, dtype=np.int64)
-        self._confirmed = np.full(count, NEVER, dtype=np.int64)
+        self.confirmed = np.full(count, NEVER, dtype=np.int64)
         self._open: dict[int, dict[str, int]] = {}
         self._seen = np.full(count, NEVER, dtype=np.int64)
         self._queue = np.zeros(count)
@@ -63,7 +64,7 @@ class Records:
 
     def confirm(self, sensor_id: int, decision_id: str, step: int) -> None:
         """Make the visit final: it succeeded, or its outcome will never be known."""
-        self._confirmed[sensor_id] = max(self._confirmed[sensor_id], step)
+        self.confirmed[sensor_id] = max(self.confirmed[sensor_id], step)
         self.withdraw(sensor_id, decision_id)
 
     def withdraw(self, sensor_id: int, decision_id: str) -> None:
@@ -76,13 +77,13 @@ class Records:
 
     def _update(self, sensor_id: int) -> None:
         presumed = max(self._open.get(sensor_id, {}).values(), default=NEVER)
-        self.visits[sensor_id] = max(int(self._confirmed[sensor_id]), presumed)
+        self.visits[sensor_id] = max(int(self.confirmed[sensor_id]), presumed)
 
     def state_dict(self) -> dict[str, Any]:
         """The whole state, as copies."""
         return {
             "visits": self.visits.copy(),
-            "confirmed": self._confirmed.copy(),
+            "confirmed": self.confirmed.copy(),
             "open": {sensor: dict(waiting) for sensor, waiting in self._open.items()},
             "seen": self._seen.copy(),
             "queue": self._queue.copy(),
@@ -92,7 +93,7 @@ class Records:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state."""
-        self.visits, self._confirmed, self._open = state["visits"], state["confirmed"], state["open"]
+        self.visits, self.confirmed, self._open = state["visits"], state["confirmed"], state["open"]
         self._seen, self._queue = state["seen"], state["queue"]
         self._arrivals, self._exposure = state["arrivals"], state["exposure"]
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
 from shared.client.report_encoders import DeltaReports, FullReports
 from shared.client.retries_and_redirects import Answer, Requests, Send, Sleep, TryAgain, parse
-from shared.planning.orders import GuidanceAnswer, GuidanceStatus
+from shared.planning.guidance_messages import GuidanceAnswer, GuidanceStatus
 from shared.wire.missions import MissionStatus
 from shared.wire.problem import INCOMPLETE
 from shared.wire.readings import ReadingsRequest, ReadingsResponse

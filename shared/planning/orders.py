@@ -6,14 +6,16 @@ guidance. Empty guidance changes no number anywhere.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+import operator
+from collections.abc import Collection, Mapping
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import AwareDatetime, Field, ValidationError, model_validator
 
-from shared.wire.schemas import MissionId, Note, SensorId
-from shared.wire.strict_models import Received, Wire
+from shared.wire.schemas import SensorId, Step
+from shared.wire.strict_models import Received
 from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario
 
@@ -24,6 +26,36 @@ MAX_EVERY = 1000
 # The cost in lost packets of each step in which a sensor is overdue. It is above the loss of the fullest sensor in one
 # step, so that a deadline gives way only to several sensors that overflow.
 LATE_PACKETS = 20.0
+
+
+# The name of an order: a fleet has one order of each name in force.
+OrderName = Annotated[str, Field(pattern=r"^((visit|weight):\d{1,9}|min_velocity|max_velocity|avoid:\d{1,2})$")]
+Clock = Annotated[AwareDatetime, Field(strict=False)]
+
+
+class End(Received):
+    """The end of an order: at a step, after some steps, at a time of the edge's clock, or when a sensor was visited.
+
+    An order whose end has come ends before the next decision.
+    """
+
+    step: Step | None = Field(None, description="the first step no longer under the order")
+    steps: int | None = Field(None, ge=1, le=100_000, description="this many steps, from the beginning of the order on")
+    time: Clock | None = Field(None, description="ISO 8601, with its offset from UTC")
+    visited: SensorId | None = Field(None, description="a visit of this sensor that succeeded")
+
+    @model_validator(mode="after")
+    def _one_of_them(self) -> Self:
+        if [self.step, self.steps, self.time, self.visited].count(None) != 3:
+            raise ValueError("give one of step, steps, time and visited")
+        return self
+
+    def __str__(self) -> str:
+        if self.step is not None or self.steps is not None:
+            return f"for {self.steps} steps" if self.step is None else f"until step {self.step}"
+        return (
+            f"until {self.time.isoformat(' ', 'minutes')}" if self.time else f"until sensor {self.visited} was visited"
+        )
 
 
 class SensorWish(Received):
@@ -48,6 +80,57 @@ class Guidance(Received):
     min_velocity: Level | None = None
     max_velocity: Level | None = None
     forbidden_velocities: list[Level] = Field([], max_length=15, fail_fast=True)
+    ends: dict[OrderName, End] = Field(
+        {},
+        exclude_if=operator.not_,
+        description="the ends of orders, by their names: `visit:4`, `weight:4`, `min_velocity`, `max_velocity`, "
+        "`avoid:0`; the other orders stay until they are withdrawn or replaced",
+    )
+
+    @classmethod
+    def of(cls, values: Mapping[str, float], ends: Mapping[str, End]) -> Self:
+        """The guidance of orders by name, as :attr:`values` has them; ends of other orders are left out.
+
+        Raises:
+            Impossible: a value is out of range, or more than 1,000 sensors have orders.
+        """
+        wishes: dict[int, dict[str, float]] = {}
+        for name, value in values.items():
+            kind, _, number = name.partition(":")
+            if kind in ("visit", "weight"):
+                wish = wishes.setdefault(int(number), {"sensor_id": int(number)})
+                wish["weight" if kind == "weight" else "visit_every"] = value
+        try:
+            return cls.model_validate(
+                {
+                    "sensors": list(wishes.values()),
+                    "forbidden_velocities": [value for name, value in values.items() if name.startswith("avoid:")],
+                    "ends": {name: end for name, end in ends.items() if name in values},
+                    **{name: value for name, value in values.items() if name.endswith("_velocity")},
+                }
+            )
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise Impossible(str(first["loc"][-1] if first["loc"] else "sensors"), first["msg"]) from None
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Each order's value by its name: steps, the factor of a weight, or m/s."""
+        values: dict[str, float] = {}
+        for wish in self.sensors:
+            if wish.visit_every is not None:
+                values[f"visit:{wish.sensor_id}"] = wish.visit_every
+            if wish.weight != 1.0:
+                values[f"weight:{wish.sensor_id}"] = wish.weight
+        limits = {"min_velocity": self.min_velocity, "max_velocity": self.max_velocity}
+        values |= {name: value for name, value in limits.items() if value is not None}
+        return values | {f"avoid:{level}": level for level in sorted(self.forbidden_velocities)}
+
+    @model_validator(mode="after")
+    def _ends_of_orders(self) -> Self:
+        if unknown := self.ends.keys() - self.values:
+            raise ValueError(f"ends names {min(unknown)}, which is no order of this guidance")
+        return self
 
     @model_validator(mode="after")
     def _each_sensor_once(self) -> Self:
@@ -170,33 +253,71 @@ class Guidance(Received):
         forbidden = np.flatnonzero(~(both if both.any() else allowed)).tolist()
         return Guidance(sensors=[*self.sensors, *others][:MAX_WISHES], forbidden_velocities=forbidden)
 
+    def without(self, names: Collection[str]) -> Self:
+        """These orders without those of some names."""
+        return self.of({name: value for name, value in self.values.items() if name not in names}, self.ends)
+
+    def added_to(self, in_force: Guidance, levels: int) -> Guidance:
+        """The orders in force and these: where two contradict each other, this guidance's.
+
+        An order contradicts one of the same name, a visit that its sensor is ignored, and velocities each other if they
+        leave none of 0..levels - 1 m/s.
+
+        Raises:
+            Impossible: more than 1,000 sensors have orders.
+        """
+        own, kept = self.values, in_force.values
+        for name, value in own.items():
+            kind, _, number = name.partition(":")
+            if kind == "weight" and value == 0:
+                kept.pop(f"visit:{number}", None)
+            elif kind == "visit" and kept.get(f"weight:{number}") == 0:
+                del kept[f"weight:{number}"]
+        ends = {name: end for name, end in in_force.ends.items() if name not in own} | self.ends
+        both = self.of(kept | own, ends)
+        if not both.allowed(levels).any():
+            velocities = [name for name in kept if name not in own and not name.startswith(("visit:", "weight:"))]
+            fewer = [both.without([name]) for name in velocities]
+            both = next((one for one in fewer if one.allowed(levels).any()), both.without(velocities))
+        return both
+
     def in_words(self) -> str:
         """The orders in plain English, from the structure alone."""
-        return " ".join(self._each_in_words()) or "Nothing beyond the mission's own rules."
+        return " ".join(self.each_in_words().values()) or "Nothing beyond the mission's own rules."
 
     def beyond(self, other: Guidance) -> list[str]:
         """The orders, each in words, that the other guidance does not have."""
-        others = set(other._each_in_words())
-        return [order for order in self._each_in_words() if order not in others]
+        others = set(other.each_in_words().values())
+        return [order for order in self.each_in_words().values() if order not in others]
 
-    def _each_in_words(self) -> list[str]:
-        words = []
-        for wish in self.sensors:
-            if wish.visit_every is not None:
-                often = "in every step" if wish.visit_every == 1 else f"at least once in every {wish.visit_every} steps"
-                words.append(f"Visit sensor {wish.sensor_id} {often}.")
-            if wish.weight == 0:
-                words.append(f"Ignore what sensor {wish.sensor_id} loses.")
-            elif wish.weight != 1:
-                words.append(f"Count each packet that sensor {wish.sensor_id} loses {wish.weight:g} times.")
-        if self.min_velocity is not None:
-            words.append(f"Never fly slower than {self.min_velocity} m/s.")
-        if self.max_velocity is not None:
-            words.append(f"Never fly faster than {self.max_velocity} m/s.")
-        if self.forbidden_velocities:
-            levels = " or ".join(map(str, sorted(set(self.forbidden_velocities))))
-            words.append(f"Never fly at {levels} m/s.")
+    def each_in_words(self) -> dict[str, str]:
+        """Each order in words, by its name."""
+        words = {}
+        for name, value in self.values.items():
+            end = self.ends.get(name)
+            text = _in_words(*name.split(":"), value=value)
+            if once(name, value, end):
+                text, end = f"Visit sensor {name[6:]} once, as soon as possible", None
+            words[name] = f"{text}{'' if end is None else f', {end}'}."
         return words
+
+
+def once(name: str, value: float, end: End | None) -> bool:
+    """Whether an order is one visit: it is due in every step until it was made."""
+    return end is not None and value == 1 and name == f"visit:{end.visited}"
+
+
+def _in_words(kind: str, number: str = "", *, value: float) -> str:
+    if kind == "visit":
+        return f"Visit sensor {number} " + (
+            "in every step" if value == 1 else f"at least once in every {value:g} steps"
+        )
+    if kind == "weight" and value == 0:
+        return f"Ignore what sensor {number} loses"
+    if kind == "weight":
+        return f"Count each packet that sensor {number} loses {value:g} times"
+    how = {"min_velocity": "slower than", "max_velocity": "faster than"}.get(kind, "at")
+    return f"Never fly {how} {value:g} m/s"
 
 
 class Impossible(ValueError):
@@ -209,57 +330,3 @@ class Impossible(ValueError):
 
 
 NO_GUIDANCE = Guidance()
-
-# `none`: neither a note nor a structure of the operator's.
-GuidanceState = Literal["none", "compiling", "proposed", "confirmed", "rejected", "failed"]
-
-
-class GuidanceStatus(Wire):
-    """``GET /missions/{id}/guidance``: the operator's note, the guidance from it, and its status.
-
-    The edge obeys only ``confirmed`` guidance. The compact prompt shows ``proposed`` guidance too, which the LLM alone
-    decides by in mode ``llm``.
-    """
-
-    # The status of a newer edge may have more fields.
-    model_config = ConfigDict(extra="ignore")
-
-    mission_id: MissionId
-    status: GuidanceState
-    note: str | None = None
-    guidance: Guidance | None = Field(None, description="compiled from the note, or given by the operator")
-    in_words: str | None = Field(None, description="the guidance in plain English, from the structure alone")
-    obeyed_in_words: str | None = Field(None, description="the orders that are obeyed now, in plain English")
-    origin: Literal["llm", "operator"] | None = Field(None, description="the author of the structure")
-    model: str | None = Field(None, description="the LLM that compiled the note")
-    failure: str | None = Field(None, description="why the note could not be compiled")
-    doubts: list[str] = Field([], description="what may be wrong with the LLM's reading; empty if it is certain")
-    begins: list[str] = Field([], description="the orders that begin when `guidance` is confirmed, each in words")
-    ends: list[str] = Field([], description="the orders in force that end when `guidance` is confirmed, each in words")
-    begun: list[str] = Field([], description="the orders that began when those in force last changed, each in words")
-    ended: list[str] = Field([], description="the orders that ended when those in force last changed, each in words")
-    version: str = Field("", description="another one after every change; an answer may name the one that it answers")
-
-
-class GuidanceAnswer(Received):
-    """``POST /missions/{id}/guidance``: confirm or reject the compiled guidance, replace it, or withdraw all orders.
-
-    A new note is compiled, and obeyed once it is confirmed; until then the orders before it stay. A given structure
-    counts as confirmed. It needs neither an LLM nor a note. Both replace all orders in force. `withdraw` ends these,
-    whatever has become of the note; `reject` does the same where no proposal waits for an answer.
-    """
-
-    answer: Literal["confirm", "reject", "withdraw"] | None = None
-    guidance: Guidance | None = None
-    note: Note | None = Field(
-        None, description="a new note in plain words; a long prompt keeps the text of the mission's first one"
-    )
-    version: str | None = Field(
-        None, max_length=64, description="the status's `version`: the answer gets 409 if the guidance has changed since"
-    )
-
-    @model_validator(mode="after")
-    def _one_of_them(self) -> Self:
-        if [self.answer, self.guidance, self.note].count(None) != 2:
-            raise ValueError("give one of answer, guidance and note")
-        return self

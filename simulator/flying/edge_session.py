@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from shared.client.edge_client import API_KEY, EdgeClient
 from shared.client.errors import EdgeRefused
-from shared.planning.orders import GuidanceAnswer
+from shared.planning.guidance_messages import GuidanceAnswer
 from shared.wire.missions import MissionStatus
 from shared.wire.schemas import MissionSpec
 from shared.world.scenario import Scenario

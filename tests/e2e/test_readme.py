@@ -8,7 +8,7 @@ import httpx
 import pytest
 
 from service.config.settings import Settings
-from shared.planning.orders import GuidanceStatus
+from shared.planning.guidance_messages import GuidanceStatus
 from shared.wire.reasons import Reason
 from shared.wire.schemas import DecideResponse
 from tests.conftest import Edge

@@ -14,7 +14,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from shared.planning.orders import GuidanceAnswer, GuidanceStatus
+from shared.planning.guidance_messages import GuidanceAnswer, GuidanceStatus
 from shared.wire.missions import MissionStatus
 from shared.wire.problem import Problem
 from shared.wire.schemas import (

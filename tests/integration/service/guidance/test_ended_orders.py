@@ -109,12 +109,14 @@ def test_what_a_confirmation_ends_is_said_before_and_after_and_in_the_journal(ed
         say(client, note="Look at sensor 3 every 4 steps.")
         third = guidance(client, "proposed")
         fourth_step = "Visit sensor 3 at least once in every 4 steps."
-        assert (third["begins"], third["ends"]) == ([fourth_step], [NOTED_IN_WORDS, "Never fly faster than 9 m/s."])
-        told = say(client, answer="confirm")
+        assert (third["begins"], third["ends"]) == ([fourth_step], [NOTED_IN_WORDS])
+        limit = "Never fly faster than 9 m/s."
+        assert (third["stays"], third["ends_if_replaced"]) == ([limit], [NOTED_IN_WORDS, limit])
+        told = say(client, answer="confirm", change="replace")
         assert (told["begins"], told["ends"]) == ([], [])
-        assert (told["begun"], told["ended"]) == (third["begins"], third["ends"])
+        assert (told["begun"], told["ended"]) == (third["begins"], third["ends_if_replaced"])
         # A structure takes effect at once, so that this is said afterwards.
-        own = say(client, guidance=OWN)
+        own = say(client, guidance=OWN, change="replace")
         assert (own["begun"], own["ended"]) == (OWN_IN_WORDS, [fourth_step])
         with sqlite3.connect(tmp_path / "missions-0.db") as db:
             rows = db.execute("SELECT body FROM journal WHERE kind = 'guided' ORDER BY seq DESC LIMIT 2").fetchall()

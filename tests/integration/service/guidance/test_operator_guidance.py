@@ -29,7 +29,8 @@ from service.llm.server import LlmServer, ServerStatus
 from service.mission.mission import Mission
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.paper_prompt import Template
-from shared.planning.orders import Guidance, GuidanceAnswer, SensorWish
+from shared.planning.guidance_messages import GuidanceAnswer
+from shared.planning.orders import Guidance, SensorWish
 from shared.wire.schemas import MissionSpec
 from shared.world.actions import Action
 from tests.integration.service.api.test_routes import fields
@@ -103,9 +104,12 @@ def test_a_note_is_compiled_proposed_and_obeyed_only_once_confirmed(edge: Edge, 
             "failure": None,
             "doubts": ["How well this LLM reads notes is not known: compare each order with the note."],
             "begins": ["Visit sensor 3 at least once in every 3 steps."],
+            "stays": [],
             "ends": [],
+            "ends_if_replaced": [],
             "begun": [],
             "ended": [],
+            "orders": [],
             "version": told["version"],
         }
         # At step 2 sensor 3 is due, and its queue is the shortest.

@@ -14,7 +14,8 @@ from service.observability.metrics import Metrics
 from service.storage.journal import Journal
 from service.storage.recovery import restore_mission
 from service.storage.store import Store
-from shared.planning.orders import Guidance, GuidanceAnswer, SensorWish
+from shared.planning.guidance_messages import GuidanceAnswer
+from shared.planning.orders import Guidance, SensorWish
 from shared.wire.schemas import MissionSpec, Outcome, SensorColumns, UavState
 from shared.world.actions import Action
 from shared.world.channel import channel_gain_db

@@ -8,7 +8,8 @@ import pytest
 from service.deciding.attended_state import AttendedState
 from service.deciding.deliberation import candidates_of, template_of
 from service.mission.mission import Mission
-from shared.planning.orders import Guidance, GuidanceAnswer
+from shared.planning.guidance_messages import GuidanceAnswer
+from shared.planning.orders import Guidance
 from shared.wire.schemas import MissionSpec, Mode
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation_report import decide_request

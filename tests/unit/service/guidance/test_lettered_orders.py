@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from service.guidance.lettered_orders import meaning
 from service.guidance.note_numbers import LetteredNote, numbers_of
 from service.guidance.note_orders import BadOrders
-from shared.planning.orders import Guidance, SensorWish
+from shared.planning.orders import End, Guidance, Impossible, SensorWish
 from shared.world.scenario import SCENARIOS
 
 PAPER = SCENARIOS["paper"]
@@ -90,10 +90,25 @@ def test_every_order_has_its_meaning() -> None:
     assert len(meaning(f"visit all every {steps}", note, PAPER).guidance.sensors) == PAPER.sensors
 
 
-@pytest.mark.parametrize("said", ["visit {0} every {1}; unclear", "visit {0} every {1}; until {2}"])
-def test_what_is_in_no_order_is_a_doubt(said: str) -> None:
+def test_an_end_is_that_of_every_order() -> None:
+    note = LetteredNote.of("sensor 4 every 3 steps, max 8 m/s, until step 40, or for 2 minutes", 0)
+    a, every, fast, step, minutes = note.numbers
+    visit = f"visit {a} every {every}; max {fast}"
+    assert meaning(f"{visit}; until {step}", note, PAPER).guidance.in_words() == (
+        "Visit sensor 4 at least once in every 3 steps, until step 40. Never fly faster than 8 m/s, until step 40."
+    )
+    ends = meaning(f"{visit}; for {minutes}", note, PAPER).guidance.ends
+    assert ends == {"visit:4": End(steps=12), "max_velocity": End(steps=12)}
+    for wrong, why in ((f"until {minutes}", "is no step"), (f"for {fast}", "are no period")):
+        with pytest.raises(BadOrders, match=why):
+            meaning(f"{visit}; {wrong}", note, PAPER)
+    with pytest.raises(BadOrders, match="end twice"):
+        meaning(f"{visit}; until {step}; for {minutes}", note, PAPER)
+
+
+def test_what_is_in_no_order_is_a_doubt() -> None:
     note = LetteredNote.of("sensor 4 every 3 steps until step 40", 0)
-    found = meaning(said.format(*note.numbers), note, PAPER)
+    found = meaning("visit {} every {}; unclear".format(*list(note.numbers)[:2]), note, PAPER)
     assert found.guidance == Guidance(sensors=[SensorWish(sensor_id=4, visit_every=3)])
     assert len(found.doubts) == 1
 
@@ -123,5 +138,5 @@ def test_what_is_in_no_order_is_a_doubt(said: str) -> None:
 )
 def test_what_a_number_cannot_be_is_refused(said: str, why: str) -> None:
     note = LetteredNote.of("sensor 4, 3 steps, 9 m/s, 7, 2.5, 20 km/h, 60", 0)
-    with pytest.raises(BadOrders, match=why):
+    with pytest.raises((BadOrders, Impossible), match=why):
         meaning(said.format(*note.numbers), note, PAPER)

@@ -8,7 +8,7 @@ import pytest
 
 from service.guidance.note_orders import EXAMPLES, BadOrders, numbers_in, parse_orders, similar_examples
 from service.guidance.order_grammar import admissible, constrain_orders
-from shared.planning.orders import Guidance, SensorWish
+from shared.planning.orders import Guidance, Impossible, SensorWish
 
 NOTE = "Suspected leak at sensor 4: visit it every third step, not over 9 m/s."
 MEANT = Guidance(sensors=[SensorWish(sensor_id=4, visit_every=3)], max_velocity=9)
@@ -47,9 +47,9 @@ def test_what_the_note_does_not_bear_is_refused(text: str, why: str) -> None:
 
 
 def test_a_value_out_of_range_is_refused_by_name() -> None:
-    with pytest.raises(BadOrders, match="weight"):
+    with pytest.raises(Impossible, match="weight"):
         parse_orders("sensor 4 counts 60 times", "sensor 4 counts 60 times")
-    with pytest.raises(BadOrders, match="max_velocity"):
+    with pytest.raises(Impossible, match="max_velocity"):
         parse_orders("fly at most 60 m/s", "at most 60 m/s")
 
 

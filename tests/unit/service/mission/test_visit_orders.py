@@ -10,7 +10,8 @@ import pytest
 from service.mission import visit_orders
 from service.mission.mission_status import status_of
 from service.mission.visit_orders import VisitOrders
-from shared.planning.orders import NO_GUIDANCE, Guidance, GuidanceAnswer, SensorWish
+from shared.planning.guidance_messages import GuidanceAnswer
+from shared.planning.orders import NO_GUIDANCE, Guidance, SensorWish
 from shared.wire.missions import VisitDeadline
 from tests.support.missions import mission
 from tests.unit.service.mission.test_mission import decide, outcome

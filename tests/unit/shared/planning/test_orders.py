@@ -11,7 +11,8 @@ from pydantic import ValidationError
 from shared.belief.fleet_belief import FleetBelief
 from shared.planning.fleet_problem import FleetProblem, with_fixed
 from shared.planning.greedy import look_ahead
-from shared.planning.orders import LATE_PACKETS, NO_GUIDANCE, Guidance, GuidanceAnswer, Impossible, SensorWish
+from shared.planning.guidance_messages import GuidanceAnswer
+from shared.planning.orders import LATE_PACKETS, NO_GUIDANCE, End, Guidance, Impossible, SensorWish
 from shared.planning.receding import RecedingHorizon
 from shared.world.scenario import SCENARIOS
 from tests.unit.shared.planning.test_fleetplan import changed, tiny
@@ -64,7 +65,10 @@ def test_a_structure_out_of_range_is_refused(wrong: dict[str, Any]) -> None:
 
 def test_an_answer_is_a_word_or_a_structure() -> None:
     assert GuidanceAnswer(answer="confirm").guidance is None
-    for wrong in ({}, {"answer": "confirm", "guidance": {}}, {"answer": "maybe"}):
+    wrongs: list[dict[str, Any]] = [{}, {"answer": "confirm", "guidance": {}}, {"answer": "maybe"}]
+    wrongs += [{"answer": "reject", "change": "add"}, {"answer": "confirm", "orders": ["visit:4"]}]
+    wrongs += [{"answer": "withdraw", "orders": names} for names in ([], ["everything"])]
+    for wrong in wrongs:
         with pytest.raises(ValidationError):
             GuidanceAnswer.model_validate(wrong)
 
@@ -105,9 +109,75 @@ def test_it_is_read_back_from_the_structure() -> None:
         "Never fly faster than 10 m/s."
     )
     assert Guidance(forbidden_velocities=[7, 2], min_velocity=1).in_words() == (
-        "Never fly slower than 1 m/s. Never fly at 2 or 7 m/s."
+        "Never fly slower than 1 m/s. Never fly at 2 m/s. Never fly at 7 m/s."
     )
     assert NO_GUIDANCE.in_words() == "Nothing beyond the mission's own rules."
+
+
+def test_an_order_has_a_name_and_may_have_an_end() -> None:
+    ends = {"visit:4": End(step=40), "weight:4": End(steps=10), "max_velocity": End(visited=2)}
+    guidance = LEAK.model_copy(update={"ends": ends})
+    assert guidance.each_in_words() == {
+        "visit:4": "Visit sensor 4 at least once in every 3 steps, until step 40.",
+        "weight:4": "Count each packet that sensor 4 loses 2 times, for 10 steps.",
+        "max_velocity": "Never fly faster than 10 m/s, until sensor 2 was visited.",
+    }
+    assert guidance.without({"weight:4"}).each_in_words().keys() == {"visit:4", "max_velocity"}
+    once = {"sensors": [{"sensor_id": 4, "visit_every": 1}], "ends": {"visit:4": {"visited": 4}}}
+    assert Guidance.model_validate(once).in_words() == "Visit sensor 4 once, as soon as possible."
+    clock = End.model_validate_json('{"time": "2030-05-01T14:30:00+02:00"}')
+    assert str(clock) == "until 2030-05-01 14:30+02:00"
+    assert End.model_validate(clock.model_dump(mode="json")) == clock
+    # An older reader of a structure without ends sees none.
+    assert "ends" not in LEAK.model_dump()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"visit:4": {}}, {"visit:4": {"step": 3, "steps": 3}}, {"visit:3": {"step": 3}}, {"4": {"step": 3}}],
+)
+def test_an_end_is_one_and_that_of_an_order(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        Guidance.model_validate({"sensors": [{"sensor_id": 4, "visit_every": 3}], "ends": wrong})
+
+
+def words(*wishes: dict[str, float], **velocities: Any) -> Guidance:
+    return Guidance.model_validate({"sensors": list(wishes), **velocities})
+
+
+@pytest.mark.parametrize(
+    ("in_force", "added", "left"),
+    [
+        # Another sensor, or another kind of order: both stay.
+        (words({"sensor_id": 4, "visit_every": 3}), words({"sensor_id": 2, "visit_every": 5}), {"visit:4", "visit:2"}),
+        (words({"sensor_id": 4, "visit_every": 3}), words({"sensor_id": 4, "weight": 5.0}), {"visit:4", "weight:4"}),
+        (words(min_velocity=2), words(max_velocity=8), {"min_velocity", "max_velocity"}),
+        (words(forbidden_velocities=[0]), words(forbidden_velocities=[7]), {"avoid:0", "avoid:7"}),
+        # A visit of a sensor that is ignored.
+        (words({"sensor_id": 4, "visit_every": 3}), words({"sensor_id": 4, "weight": 0.0}), {"weight:4"}),
+        (words({"sensor_id": 4, "weight": 0.0}), words({"sensor_id": 4, "visit_every": 3}), {"visit:4"}),
+        # Velocities of which none is left: only the one in the way ends.
+        (words(max_velocity=5, forbidden_velocities=[0]), words(min_velocity=8), {"avoid:0", "min_velocity"}),
+        (
+            words(min_velocity=5, max_velocity=6),
+            words(forbidden_velocities=[5, 6]),
+            {"max_velocity", "avoid:5", "avoid:6"},
+        ),
+    ],
+)
+def test_an_added_order_replaces_only_what_it_contradicts(in_force: Guidance, added: Guidance, left: set[str]) -> None:
+    both = added.added_to(in_force, 15)
+    assert both.values.keys() == left
+    assert {name: both.values[name] for name in added.values} == added.values
+
+
+def test_an_added_order_of_the_same_name_takes_its_end_along() -> None:
+    until = LEAK.model_copy(update={"ends": {"max_velocity": End(step=9)}})
+    assert until.added_to(LEAK, 15).ends == until.ends
+    assert LEAK.added_to(until, 15).ends == {}
+    with pytest.raises(Impossible, match="sensors"):
+        every = [Guidance(sensors=[SensorWish(sensor_id=i + n, visit_every=2) for i in range(600)]) for n in (0, 600)]
+        every[1].added_to(every[0], 15)
 
 
 def test_the_quick_plan_flies_what_is_allowed_and_goes_where_it_is_late() -> None:

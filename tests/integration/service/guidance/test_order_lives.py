@@ -1,0 +1,124 @@
+"""Each order's life: added or a replacement, withdrawn alone, ended by itself, recorded, kept through a restart."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.integration.service.api.test_routes import fields
+from tests.integration.service.guidance.test_ended_orders import AT, say
+from tests.integration.service.guidance.test_operator_guidance import Edge, Report
+from tests.support.processes import serving_edge
+from tests.support.waiting import PATIENCE_S
+
+VISIT, SLOW = "Visit sensor 4 at least once in every 3 steps", "Never fly faster than 8 m/s"
+LEAK = {"sensors": [{"sensor_id": 4, "visit_every": 3}]}
+
+
+def ended(**end: Any) -> dict[str, Any]:
+    """The orders of LEAK and a limit, with an end."""
+    return {**LEAK, "max_velocity": 8, "ends": {"max_velocity": end}}
+
+
+def spans(told: dict[str, Any]) -> list[tuple[str, int, int | None]]:
+    return [(order["name"], order["since_step"], order["until_step"]) for order in told["orders"]]
+
+
+def test_a_second_structure_is_added_unless_it_is_a_replacement(edge: Edge) -> None:
+    client = edge()
+    client.put("/missions/test", json={})
+    say(client, guidance=LEAK)
+    told = say(client, guidance={"max_velocity": 8})
+    assert (told["obeyed_in_words"], told["ended"]) == (f"{VISIT}. {SLOW}.", [])
+    # Another limit replaces just that one.
+    told = say(client, guidance={"max_velocity": 6})
+    assert told["ended"] == [f"{SLOW}."]
+    told = say(client, guidance={"min_velocity": 2}, change="replace")
+    assert told["obeyed_in_words"] == "Never fly slower than 2 m/s."
+    assert [(order["name"], order["until"] is None) for order in told["orders"]] == [
+        ("max_velocity", False),
+        ("visit:4", False),
+        ("max_velocity", False),
+        ("min_velocity", True),
+    ]
+
+
+def test_one_order_is_withdrawn_by_its_name(edge: Edge, report: Report) -> None:
+    client = edge()
+    client.put("/missions/test", json={})
+    say(client, guidance={**LEAK, "max_velocity": 3})
+    client.post("/decide", json=report(step=5))
+    told = say(client, answer="withdraw", orders=["max_velocity"])
+    assert (told["status"], told["obeyed_in_words"]) == ("confirmed", f"{VISIT}.")
+    assert spans(told) == [("max_velocity", 0, 6), ("visit:4", 0, None)]
+    assert client.post("/decide", json=report(step=6)).json()["velocity"] > 3
+    unknown = client.post(AT, json={"answer": "withdraw", "orders": ["max_velocity"]})
+    assert (unknown.status_code, fields(unknown)) == (409, ["orders"])
+    assert "but visit:4" in unknown.json()["detail"]
+    assert say(client, answer="withdraw", orders=["visit:4"])["status"] == "rejected"
+
+
+@pytest.mark.parametrize("end", [{"step": 3}, {"steps": 3}])
+def test_an_order_ends_at_its_step(edge: Edge, report: Report, end: dict[str, Any]) -> None:
+    client = edge()
+    client.put("/missions/test", json={})
+    told = say(client, guidance={**ended(**end), "max_velocity": 2})
+    assert told["obeyed_in_words"] == f"{VISIT}. Never fly faster than 2 m/s, until step 3."
+    velocities = [client.post("/decide", json=report(step=step)).json()["velocity"] for step in range(4)]
+    assert max(velocities[:3]) <= 2 < velocities[3]
+    told = client.get(AT).json()
+    assert (told["obeyed_in_words"], told["ended"]) == (f"{VISIT}.", ["Never fly faster than 2 m/s, until step 3."])
+    assert spans(told) == [("max_velocity", 0, 3), ("visit:4", 0, None)]
+    late = client.post(AT, json={"guidance": ended(step=4)})
+    assert (late.status_code, fields(late)) == (422, ["guidance.ends.max_velocity.step"])
+
+
+def test_an_order_ends_at_its_time(edge: Edge, report: Report) -> None:
+    client = edge()
+    client.put("/missions/test", json={})
+    now = datetime.now(UTC)
+    say(client, guidance=ended(time=(now + timedelta(hours=1)).isoformat()))
+    client.post("/decide", json=report())
+    assert SLOW in client.get(AT).json()["obeyed_in_words"]
+    say(client, guidance=ended(time=(now - timedelta(seconds=1)).isoformat()))
+    client.post("/decide", json=report(step=1))
+    assert client.get(AT).json()["obeyed_in_words"] == f"{VISIT}."
+
+
+def test_an_order_ends_with_a_visit_that_succeeded(edge: Edge, report: Report) -> None:
+    client = edge()
+    client.put("/missions/test", json={})
+    sensor = client.post("/decide", json=report()).json()["sensor_id"]
+    once = {"sensors": [{"sensor_id": sensor, "visit_every": 1}], "ends": {f"visit:{sensor}": {"visited": sensor}}}
+    words = f"Visit sensor {sensor} once, as soon as possible."
+    assert say(client, guidance=once)["obeyed_in_words"] == words
+    for step, failed in ((1, True), (2, False)):
+        decision = client.post("/decide", json=report(step=step)).json()
+        assert decision["sensor_id"] == sensor
+        # Presumed, and then failed: no visit.
+        assert client.get(AT).json()["obeyed_in_words"] == words
+        client.post("/feedback", json={"decision_id": decision["decision_id"], "cost": 0.0, "failed": failed})
+    client.post("/decide", json=report(step=3))
+    told = client.get(AT).json()
+    assert (told["obeyed_in_words"], spans(told)) == (None, [(f"visit:{sensor}", 1, 3)])
+    # A single visit has no interval, and so no deadlines.
+    assert "deadlines" not in client.get("/missions/test").json()
+
+
+def test_ends_and_records_are_kept_through_a_restart(report: Report, tmp_path: Path) -> None:
+    env = {"AICVDS_STORE": str(tmp_path / "missions.db"), "AICVDS_MODE": "value"}
+    told: dict[str, Any] = {}
+    for step in range(3):
+        with serving_edge(**env) as (url, process), httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
+            if step == 0:
+                client.put("/missions/test", json={})
+                told = say(client, guidance=ended(steps=2))
+            assert client.get(AT).json() == told
+            assert client.post("/decide", json=report(step=step)).status_code == 200
+            told = client.get(AT).json()
+            process.kill()
+    assert spans(told) == [("max_velocity", 0, 2), ("visit:4", 0, None)]
