@@ -10,6 +10,7 @@ from service.live.alarms import alarms
 from service.live.fleet_watch import Watched
 from service.live.recent_decisions import RecentDecision
 from service.mission.mission import Mission
+from shared.planning.orders import once
 from shared.wire.names import with_names
 from shared.world.scenario import Scenario
 from shared.world.trajectory import trajectories
@@ -133,22 +134,26 @@ def _uav(mission: Mission, watched: Watched, uav: int) -> dict[str, Any]:
 
 
 def _guidance(mission: Mission) -> dict[str, Any]:
-    """The operator's note, the guidance from it, and each order for a sensor with its deadline."""
-    visits, names = mission.records.visits, mission.spec.names
+    """The operator's note, the guidance from it, the orders in force, and the visits that are due, with his names."""
+    visits, confirmed, names = mission.records.visits, mission.guidance.confirmed, mission.spec.names
     report = mission.guidance.report(mission.mission_id).model_dump(exclude={"mission_id"})
-    words = {key: [with_names(one, names) for one in report[key]] for key in ("begins", "ends", "begun", "ended")}
+    lists = ("begins", "stays", "ends", "ends_if_replaced", "begun", "ended")
+    words = {key: [with_names(one, names) for one in report[key]] for key in lists}
     words |= {key: report[key] and with_names(report[key], names) for key in ("in_words", "obeyed_in_words")}
+    in_force = [order for order in report["orders"] if order["until"] is None]
     return {
         **report,
         **words,
-        "orders": [
+        "orders": [{**order, "in_words": with_names(order["in_words"], names)} for order in in_force],
+        "due": [
             {
                 "sensor_id": wish.sensor_id,
                 "visit_every": wish.visit_every,
-                "weight": wish.weight,
-                "due": None if wish.visit_every is None else int(visits[wish.sensor_id]) + wish.visit_every,
+                "due": int(visits[wish.sensor_id]) + wish.visit_every,
             }
-            for wish in mission.guidance.confirmed.sensors
+            for wish in confirmed.sensors
+            if wish.visit_every is not None
+            and not once(name := f"visit:{wish.sensor_id}", wish.visit_every, confirmed.ends.get(name))
         ],
     }
 

@@ -1,4 +1,5 @@
-// The operator's console: give a note, read what was understood, confirm or reject it, and see which deadlines are met.
+// The operator's console: give a note, read what was understood, confirm or reject it, withdraw orders, and see which
+// deadlines are met.
 
 import { at, make, say } from "./dom.js";
 import { post, Refused } from "./edge.js";
@@ -11,9 +12,12 @@ export class Operator {
     this.mission = null;
     this.busy = false;
     at("note-form").addEventListener("submit", (event) => this.#submit(event, () => ({ note: at("note-input").value.trim() }), at("note-input")));
-    at("orders-form").addEventListener("submit", (event) => this.#submit(event, () => ({ guidance: JSON.parse(at("orders-input").value) }), null));
+    at("orders-form").addEventListener("submit", (event) =>
+      this.#submit(event, () => ({ guidance: JSON.parse(at("orders-input").value), change: event.submitter?.value || "add" }), null),
+    );
     // Refused where another operator was faster: what is answered is what the page shows, also while its view is frozen.
-    for (const answer of ["confirm", "reject"]) at(answer).addEventListener("click", () => this.#send({ answer, version: this.version }));
+    const answers = { confirm: { answer: "confirm", change: "add" }, replace: { answer: "confirm", change: "replace" }, reject: { answer: "reject" } };
+    for (const [id, answer] of Object.entries(answers)) at(id).addEventListener("click", () => this.#send({ ...answer, version: this.version }));
     at("withdraw").addEventListener("click", () => this.#send({ answer: "withdraw" }));
     at("edit").addEventListener("click", () => this.#edit());
     at("orders-input").placeholder = EXAMPLE;
@@ -43,25 +47,57 @@ export class Operator {
     at("note-words").hidden = !orders;
     say(at("note-doubts"), waits ? (guidance.doubts ?? []).join(" ") : "");
     at("note-doubts").hidden = !at("note-doubts").textContent;
-    say(at("note-changes"), waits && inForce ? changes(guidance) : "");
-    at("note-changes").hidden = !at("note-changes").textContent;
+    this.#changes(waits && inForce ? changes(guidance) : []);
     at("answer").hidden = !mayCommand || !(waits || inForce);
     at("confirm").hidden = at("reject").hidden = !waits;
+    say(at("confirm"), waits && guidance.stays.length ? "Confirm, and keep the other orders" : "Confirm");
+    at("replace").hidden = !waits || guidance.ends_if_replaced.length === guidance.ends.length;
     at("withdraw").hidden = !inForce;
     at("edit").hidden = guidance.guidance === null;
     at("command").hidden = !mayCommand;
     at("read-only").hidden = mayCommand;
-    this.#orders(guidance, deadlines, step);
+    this.#orders(guidance, deadlines, step, mayCommand);
     // Once for each proposal: who closes the console wants it closed.
     if (waits && this.seen !== guidance.in_words) at("operator").open = true;
     this.seen = waits ? guidance.in_words : null;
   }
 
-  #orders(guidance, deadlines, step) {
-    say(at("orders-words"), guidance.obeyed_in_words ?? "None.");
+  #changes(parts) {
+    at("note-changes").hidden = parts.length === 0;
+    const rows = parts.map(([title, orders]) => make("li", {}, make("strong", {}, title), ` ${orders.join(" ")}`));
+    this.#renew("note-changes", parts, rows);
+  }
+
+  // Only where it differs: a new button would lose the keyboard's focus.
+  #renew(id, shown, rows) {
+    const key = JSON.stringify(shown);
+    if (at(id).dataset.shown === key) return;
+    at(id).dataset.shown = key;
+    at(id).replaceChildren(...rows);
+  }
+
+  #inForce(orders, mayCommand) {
+    say(at("orders-words"), orders.length ? "" : "None.");
+    at("orders-words").hidden = orders.length > 0;
+    const rows = orders.map((order) => {
+      const source = order.note === null ? "" : `, from the note “${order.note}”`;
+      const since = `since step ${order.since_step}, ${new Date(order.since).toLocaleTimeString()}${source}`;
+      const row = make("li", {}, make("span", { class: "words" }, order.in_words), " ", make("span", { class: "hint" }, since), " ");
+      if (mayCommand) {
+        const end = make("button", { type: "button", "aria-label": `Withdraw: ${order.in_words}` }, "Withdraw");
+        end.addEventListener("click", () => this.#send({ answer: "withdraw", orders: [order.name] }));
+        row.append(end);
+      }
+      return row;
+    });
+    this.#renew("orders-list", [orders, mayCommand], rows);
+  }
+
+  #orders(guidance, deadlines, step, mayCommand) {
+    this.#inForce(guidance.orders, mayCommand);
     say(at("orders-ended"), guidance.ended.length ? `Ended by the last change: ${guidance.ended.join(" ")}` : "");
     at("orders-ended").hidden = guidance.ended.length === 0;
-    const due = guidance.orders.filter((order) => order.due !== null);
+    const { due } = guidance;
     at("deadlines").hidden = due.length + deadlines.met + deadlines.missed === 0;
     say(at("deadlines-met"), `Visit deadlines of the steps that are over: ${deadlines.met} met, ${deadlines.missed} missed.`);
     const rows = due.map((order) => {
@@ -109,9 +145,16 @@ export class Operator {
   }
 }
 
-function changes({ begins, ends }) {
-  const parts = [ends.length && `These orders end when you confirm: ${ends.join(" ")}`, begins.length && `These begin: ${begins.join(" ")}`];
-  return parts.filter(Boolean).join(" ") || "These orders are in force already.";
+/** What a confirmation changes: titles, and the orders of each. */
+function changes({ begins, stays, ends, ends_if_replaced }) {
+  const also = ends_if_replaced.filter((order) => !ends.includes(order));
+  const parts = [
+    ["Begins when you confirm:", begins],
+    ["Stays:", stays],
+    ["Ends:", ends],
+    ["Ends too if you replace all orders:", also],
+  ].filter(([, orders]) => orders.length > 0);
+  return begins.length + ends.length ? parts : [["These orders are in force already.", []], ...parts];
 }
 
 function summary(guidance, waits) {

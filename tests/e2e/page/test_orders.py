@@ -143,37 +143,68 @@ def test_orders_that_change_in_flight_are_counted_while_they_are_in_force(
     assert shown(visit, edge, "watch") == [sum(counts) for counts in zip(*counted, strict=True)]
 
 
-def test_the_page_says_which_orders_end_and_always_offers_to_withdraw_them(renewed: str, visit: Open) -> None:
+def test_the_page_says_which_orders_begin_stay_and_end_and_always_offers_to_withdraw_them(
+    renewed: str, visit: Open
+) -> None:
     assert httpx.put(f"{renewed}/missions/two", json={"mode": "value", "note": NOTE}).status_code == 200
     page = visit(f"{renewed}/?mission=two", expected=("409",))
-    note, changes, in_force = (page.locator(f"#{name}") for name in ("note-input", "note-changes", "orders-words"))
-    send, confirm, withdraw = (
-        page.get_by_role("button", name=name) for name in ("Send the note", "Confirm", "Withdraw the orders")
+    note, changes, in_force = (
+        page.locator(f"#{name}") for name in ("note-input", "note-changes", "orders-list .words")
     )
-    # The first reading ends nothing.
-    expect(confirm).to_be_visible()
-    expect(changes).to_be_hidden()
-    expect(withdraw).to_be_hidden()
+    send, confirm, withdraw = (page.locator(name) for name in ("#note-form button", "#confirm", "#withdraw"))
+    replace = page.get_by_role("button", name="Confirm, and replace all orders")
+    # The first reading changes nothing else.
+    expect(confirm).to_have_text("Confirm")
+    for hidden in (changes, withdraw, replace):
+        expect(hidden).to_be_hidden()
     confirm.click()
-    expect(in_force).to_have_text(FIRST)
+    expect(in_force).to_have_text([FIRST])
+    expect(page.locator("#orders-list .hint")).to_contain_text("since step 0, ")
+    expect(page.locator("#orders-list .hint")).to_contain_text(f"from the note “{NOTE}”")
     note.fill("Look at sensor 2 every 4 steps.")
     send.click()
-    expect(changes).to_have_text(f"These orders end when you confirm: {FIRST} These begin: {SECOND}")
+    expect(changes.locator("li")).to_have_text(
+        [f"Begins when you confirm: {SECOND}", f"Stays: {FIRST}", f"Ends too if you replace all orders: {FIRST}"]
+    )
+    expect(confirm).to_have_text("Confirm, and keep the other orders")
+    expect(replace).to_be_visible()
     expect(withdraw).to_be_visible()
     assert violations(page) == []
     # Another operator answers meanwhile; what this one confirms is what the page shows.
     page.get_by_role("button", name="Freeze view").click()
-    guide(renewed, "two", guidance={"max_velocity": 9})
+    guide(renewed, "two", guidance={"max_velocity": 9}, change="replace")
     confirm.click()
     expect(page.locator("#operator-error")).to_contain_text("the guidance has changed since")
     page.get_by_role("button", name="Freeze view").click()
-    expect(in_force).to_have_text("Never fly faster than 9 m/s.")
+    expect(in_force).to_have_text(["Never fly faster than 9 m/s."])
     expect(page.locator("#orders-ended")).to_have_text(f"Ended by the last change: {FIRST}")
     note.fill("Mind sensor 2.")
     send.click()
     expect(page.locator("#note-state")).to_contain_text("was not understood")
     withdraw.click()
-    expect(in_force).to_have_text("None.")
+    expect(page.locator("#orders-words")).to_have_text("None.")
     expect(page.locator("#orders-ended")).to_contain_text("Never fly faster than 9 m/s.")
     expect(page.locator("#note-state")).to_contain_text("was not understood")
     expect(withdraw).to_be_hidden()
+
+
+def test_a_structure_is_added_or_replaces_and_each_order_can_be_withdrawn(edge: str, visit: Open) -> None:
+    assert httpx.put(f"{edge}/missions/own", json={"mode": "value"}).status_code == 200
+    page = visit(f"{edge}/?mission=own")
+    page.locator("#operator > summary").click()
+    page.locator("#structure > summary").click()
+    in_force = page.locator("#orders-list .words")
+    limit, slow = "Never fly faster than 9 m/s, until step 40.", "Never fly slower than 2 m/s."
+    for orders, button, left in (
+        ({"sensors": [{"sensor_id": 3, "visit_every": 3}]}, "Add these orders", [FIRST]),
+        ({"max_velocity": 9, "ends": {"max_velocity": {"step": 40}}}, "Add these orders", [FIRST, limit]),
+        ({"min_velocity": 2}, "Replace all orders by these", [slow]),
+        ({"sensors": [{"sensor_id": 2, "visit_every": 4}]}, "Add these orders", [slow, SECOND]),
+    ):
+        page.locator("#orders-input").fill(json.dumps(orders))
+        page.get_by_role("button", name=button).click()
+        expect(in_force).to_have_text(left)
+    assert violations(page) == []
+    page.get_by_role("button", name=f"Withdraw: {slow}").click()
+    expect(in_force).to_have_text([SECOND])
+    expect(page.locator("#orders-ended")).to_have_text(f"Ended by the last change: {slow}")
