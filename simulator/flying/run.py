@@ -210,11 +210,13 @@ def _operator(probe: EdgeClient, mission_id: str, flight: Flight) -> OperatorRec
         guidance, status = probe.guidance(mission_id), probe.mission(mission_id)
     except EdgeError:
         return None
-    orders = status.deadlines or []
-    if guidance.note is None and guidance.obeyed_in_words is None and not orders:
+    in_force = [
+        one for one in guidance.orders if one.since_step < flight.steps_flown and one.until_step != one.since_step
+    ]
+    if guidance.note is None and not in_force:
         return None
-    deadlines = recount_deadlines(orders, flight.decisions, flight.steps_flown)
-    return OperatorRecord(note=guidance.note, orders=guidance.obeyed_in_words, deadlines=deadlines)
+    deadlines = recount_deadlines(status.deadlines or [], flight.decisions, flight.steps_flown)
+    return OperatorRecord(in_force=in_force, deadlines=deadlines)
 
 
 def _with_bound(job: Job, flight: Flight, summary: Summary, console: Console) -> Summary:

@@ -1,7 +1,8 @@
-"""The operator's part of a flight: the note, the orders, and the visit deadlines met and missed."""
+"""The operator's part of a flight: the orders that were in force, and the visit deadlines met and missed."""
 
 from collections.abc import Iterable, Sequence
 
+from shared.planning.guidance_messages import OrderRecord
 from shared.planning.visit_deadlines import count_deadlines
 from shared.wire.missions import VisitDeadline
 from simulator.records.decision import Decision
@@ -9,10 +10,9 @@ from simulator.records.record import Record
 
 
 class OperatorRecord(Record):
-    """The operator's newest note, the orders in force at the end in words, and every visit order's deadlines."""
+    """Every order that was in force in a step of the flight, with its note, and every visit order's deadlines."""
 
-    note: str | None
-    orders: str | None
+    in_force: list[OrderRecord] = []
     deadlines: list[VisitDeadline]
 
     @property

@@ -127,9 +127,10 @@ def orders_text(summary: Summary) -> str | None:
     """Whether the operator's orders were in force; ``None`` where the operator gave neither orders nor a note."""
     if summary.operator is None:
         return None
-    if not summary.operator.orders:
-        return "No order of the operator was in force at the end: none was confirmed, or the last were withdrawn."
-    return f"The fleet obeyed the operator's orders, which may cost packets: {summary.operator.orders}"
+    if not summary.operator.in_force:
+        return "No order of the operator was in force: none was confirmed."
+    orders = " ".join(dict.fromkeys(order.in_words for order in summary.operator.in_force))
+    return f"The fleet obeyed the operator's orders, which may cost packets: {orders}"
 
 
 def late_text(summary: Summary) -> str | None:

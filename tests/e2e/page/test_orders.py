@@ -101,12 +101,17 @@ def test_a_confirmed_note_shows_the_same_deadlines_everywhere(edge: str, visit: 
     assert met > 0 and missed > 0
     operator = json.loads((out / "summary.json").read_bytes())["operator"]
     told = httpx.get(f"{edge}/missions/patrol").json()["deadlines"]
-    assert operator["note"] == NOTE and operator["deadlines"] == told
+    (flown,) = operator["in_force"]
+    assert (flown["note"], flown["in_words"], flown["since_step"], flown["until_step"]) == (NOTE, FIRST, 0, None)
+    assert operator["deadlines"] == told
     assert told == [{"sensor_id": 3, "visit_every": EVERY, "since": 0, "until": None, "met": met, "missed": missed}]
     report = (out / "report.html").read_text(encoding="utf-8")
     assert f"<td>visit deadlines met / missed</td><td>{met} / {missed}</td>" in report
     assert f"<td>sensor 3, every 3 steps</td><td>0</td><td>29</td><td>{met}</td><td>{missed}</td>" in report
-    assert NOTE in report and "which may cost packets: Visit sensor 3 at least once in every 3 steps." in report
+    assert f"which may cost packets: {FIRST}" in report
+    assert re.search(
+        rf"<td>{FIRST}</td><td>0</td><td>29</td><td>[-0-9 :]+</td><td>in force at the end</td><td>“{NOTE}”</td>", report
+    )
     assert shown(visit, edge, "patrol") == counted
 
 
@@ -114,7 +119,7 @@ def test_orders_that_change_in_flight_are_counted_while_they_are_in_force(
     edge: str, visit: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, decide = tmp_path / "run", EdgePilot.decide
-    own = {"sensors": [{"sensor_id": 3, "visit_every": EVERY}, {"sensor_id": 5, "visit_every": 2}]}
+    own = {"sensors": [{"sensor_id": 3, "visit_every": EVERY}, {"sensor_id": 5, "visit_every": 2}], "max_velocity": 12}
 
     def deciding(pilot: EdgePilot, uav: int, seen: Observation, taken: frozenset[int]) -> PilotChoice:
         at = (int(seen["step"][0]), uav)
@@ -138,7 +143,16 @@ def test_orders_that_change_in_flight_are_counted_while_they_are_in_force(
     names = ("sensor_id", "visit_every", "since", "until", "met", "missed")
     expected = [dict(zip(names, (*span, *counts), strict=True)) for span, counts in zip(spans, counted, strict=True)]
     operator = json.loads((out / "summary.json").read_bytes())["operator"]
-    assert operator == {"note": NOTE, "orders": None, "deadlines": expected}
+    assert operator["deadlines"] == expected
+    noted, own, limit = operator["in_force"]
+    assert [(one["name"], one["since_step"], one["until_step"]) for one in (noted, own, limit)] == [
+        ("visit:3", 4, 20),
+        ("visit:5", 13, 20),
+        ("max_velocity", 13, 20),
+    ]
+    # The note is the source of its own orders only.
+    assert [one["note"] for one in (noted, own, limit)] == [NOTE, None, None]
+    assert all(one["since"] <= one["until"] for one in (noted, own, limit))
     assert httpx.get(f"{edge}/missions/watch").json()["deadlines"] == expected
     assert shown(visit, edge, "watch") == [sum(counts) for counts in zip(*counted, strict=True)]
 

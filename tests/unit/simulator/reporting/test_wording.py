@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from shared.planning.guidance_messages import OrderRecord
 from shared.world.scenario import Scenario
 from simulator.flying.flight import fly
 from simulator.flying.pilots import LocalPilot
@@ -101,10 +102,17 @@ def test_the_verdict_ranks(flight: Flight) -> None:
 def test_the_operators_orders_are_named_beside_the_losses(flight: Flight) -> None:
     summary = summary_of(flight, None)
     assert orders_text(summary) is None
-    note = "Visit sensor 3."
-    unconfirmed, obeyed = (OperatorRecord(note=note, orders=orders, deadlines=[]) for orders in (None, note))
+    order = {
+        "name": "visit:3",
+        "in_words": "Visit sensor 3.",
+        "note": None,
+        "since_step": 0,
+        "since": summary.started_at,
+    }
+    record = OrderRecord.model_validate(order)
+    unconfirmed, obeyed = (OperatorRecord(in_force=orders, deadlines=[]) for orders in ([], [record, record]))
     said = orders_text(summary.model_copy(update={"operator": unconfirmed}))
-    assert said is not None and said.startswith("No order of the operator was in force at the end")
+    assert said is not None and said.startswith("No order of the operator was in force")
     said = orders_text(summary.model_copy(update={"operator": obeyed}))
     assert said == "The fleet obeyed the operator's orders, which may cost packets: Visit sensor 3."
 
