@@ -28,6 +28,7 @@ from rich.table import Table
 from service.config.settings import Settings
 from service.guidance.note_compiler import compile_note
 from service.guidance.note_orders import BadOrders, number_of, parse_orders, similar_examples
+from service.guidance.note_phrases import PhrasedNote
 from service.llm.answers import NoDecision
 from service.llm.server_pool import ServerPool
 from service.prompting.warm_up import warm_up
@@ -74,7 +75,7 @@ async def understood(notes: list[dict[str, object]]) -> tuple[str | None, list[U
             llm: Guidance | None = None
             doubts: tuple[str, ...] = ()
             try:
-                reading = await compile_note(note, SCENARIOS["paper"], upstream)
+                reading = await compile_note(PhrasedNote(note, SCENARIOS["paper"], ()), SCENARIOS["paper"], upstream)
                 llm, doubts = reading.guidance, reading.doubts
             except (BadOrders, Impossible, NoDecision, TimeoutError) as error:
                 why = str(error) or "late"

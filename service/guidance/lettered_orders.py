@@ -30,10 +30,12 @@ class NoteReading:
 
     Attributes:
         doubts: sentences about what may be wrong; empty if nothing is known to be.
+        numbers: the numbers of the note that the orders use.
     """
 
     guidance: Guidance
     doubts: tuple[str, ...] = ()
+    numbers: frozenset[float] = frozenset()
 
 
 def grammar(note: LetteredNote) -> str:
@@ -66,7 +68,7 @@ def meaning(answer: str, note: LetteredNote, scenario: Scenario) -> NoteReading:
     if words != NOTHING:
         for order in words.split(SEPARATOR):
             orders.add(order)
-    return NoteReading(orders.guidance(), tuple(orders.doubts))
+    return NoteReading(orders.guidance(), tuple(orders.doubts), frozenset(orders.used))
 
 
 class _Orders:
@@ -79,6 +81,7 @@ class _Orders:
         self._end: End | None = None
         self._others = False
         self.doubts: list[str] = []
+        self.used: set[float] = set()
 
     def add(self, order: str) -> None:
         """Add one order; raises :class:`BadOrders`."""
@@ -166,6 +169,7 @@ class _Orders:
     def _number(self, letter: str) -> Number:
         if letter not in self._numbers:
             raise BadOrders(f"{letter[:20]!r} is no number of the note")
+        self.used.add(self._numbers[letter].value)
         return self._numbers[letter]
 
     def _plain(self, letter: str, what: str) -> float:

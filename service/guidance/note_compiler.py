@@ -24,12 +24,13 @@ from typing import Protocol
 from service.guidance.lettered_orders import STATIC, NoteReading, grammar, meaning
 from service.guidance.note_numbers import LetteredNote
 from service.guidance.note_orders import INSTRUCTION, BadOrders, parse_orders, similar_examples
+from service.guidance.note_phrases import PhrasedNote
 from service.guidance.operator_guidance import OperatorGuidance
 from service.guidance.order_grammar import constrain_orders
 from service.llm.answers import Completion, NoDecision
 from service.llm.request_bodies import Constraint, Rewriting
 from service.llm.server_pool import ServerPool
-from shared.planning.orders import Guidance, Impossible
+from shared.planning.orders import NO_GUIDANCE, Guidance, Impossible
 from shared.world.scenario import Scenario
 
 log = logging.getLogger(__name__)
@@ -110,7 +111,7 @@ def _most(found: Sequence[tuple[NoteReading | BadOrders | Impossible, float]]) -
         doubts.append(_DIFFER)
     elif min(probability for _, probability in found) < _SURE:
         doubts.append(_UNLIKELY)
-    return NoteReading(reading.guidance, tuple(doubts))
+    return NoteReading(reading.guidance, tuple(doubts), reading.numbers)
 
 
 class NoteOwner(Protocol):
@@ -124,8 +125,10 @@ class NoteOwner(Protocol):
         """The note with sensors' IDs for the user's names, and doubts."""
         ...
 
-    def propose_guidance(self, guidance: Guidance, model: str | None, doubts: Sequence[str] = ()) -> None:
-        """Propose the guidance that an LLM made of the note."""
+    def propose_guidance(
+        self, guidance: Guidance, model: str | None, doubts: Sequence[str] = (), withdrawn: Sequence[str] = ()
+    ) -> None:
+        """Propose the guidance that was read in the note."""
         ...
 
     def fail_guidance(self, reason: str, model: str | None) -> None:
@@ -169,15 +172,19 @@ class NoteCompiler:
 
     async def _compile_once(self, mission: NoteOwner, note: str) -> None:
         """Compile this note; the result is dropped if the mission has another note by then."""
+        text, unclear = await asyncio.to_thread(mission.in_ids, note)
+        phrased = PhrasedNote(text, mission.scenario, mission.guidance.confirmed.values)
         try:
             async with asyncio.timeout(_TIMEOUT_S), self._lock:
-                await self._wait_for_llm()
+                if not phrased.is_read:
+                    await self._wait_for_llm()
                 if not _waits_for(mission, note):
                     return
-                text, unclear = await asyncio.to_thread(mission.in_ids, note)
-                compiled = await compile_note(text, mission.scenario, self._llm)
+                compiled = await compile_note(phrased, mission.scenario, self._llm)
             if _waits_for(mission, note):
-                mission.propose_guidance(compiled.guidance, self._llm.notes_model, (*unclear, *compiled.doubts))
+                model = None if phrased.is_read else self._llm.notes_model
+                doubts = (*unclear, *compiled.doubts)
+                mission.propose_guidance(compiled.guidance, model, doubts, phrased.withdrawn)
                 self._on_change(mission.mission_id)
             return
         except (BadOrders, Impossible, NoDecision) as error:
@@ -204,8 +211,8 @@ def _waits_for(mission: NoteOwner, note: str) -> bool:
     return mission.guidance.status == "compiling" and mission.guidance.note == note
 
 
-async def compile_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReading:
-    """The note's reading: with the orders' adapter, or else the first answer that passes every check.
+async def compile_note(note: PhrasedNote, scenario: Scenario, llm: ServerPool) -> NoteReading:
+    """The note's reading: by phrases, and of the rest with the orders' adapter, or else the first answer that passes.
 
     Raises:
         BadOrders: no answer passes, and the first one does not match the note; or the note contains no order.
@@ -213,13 +220,23 @@ async def compile_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteRe
         NoDecision: the LLM gave no answer.
     """
     started = time.monotonic()
-    if llm.reads_letters:
-        async with asyncio.timeout(_ANSWER_S):
-            reading = await read_note(note, scenario, llm)
-    else:
-        reading = await _rewrite_note(note, scenario, llm)
+    try:
+        if note.is_read:
+            reading = NoteReading(NO_GUIDANCE)
+        elif llm.reads_letters:
+            async with asyncio.timeout(_ANSWER_S):
+                reading = await read_note(note.text, scenario, llm)
+        else:
+            reading = await _rewrite_note(note.text, scenario, llm)
+    except (BadOrders, Impossible) as error:
+        if not note.orders:
+            raise
+        # What code has read is proposed all the same.
+        reading = NoteReading(NO_GUIDANCE, (f"In no order: “{note.text}”: {error}.",))
+    guidance, doubts = note.completed(reading.guidance, reading.numbers)
+    guidance.check(scenario)
     log.info("note compiled in %.1f s", time.monotonic() - started)
-    return reading
+    return NoteReading(guidance, (*reading.doubts, *doubts))
 
 
 async def _rewrite_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReading:
@@ -238,5 +255,6 @@ async def _rewrite_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteR
             log.debug("note, attempt %d: %r: %s", attempt, text[:80], error)
             faults.append(error)
             continue
-        return NoteReading(guidance, (_NOT_JUDGED,))
+        numbers = {float(part) for name, value in guidance.values.items() for part in (value, *name.split(":")[1:])}
+        return NoteReading(guidance, (_NOT_JUDGED,), frozenset(numbers))
     raise faults[0]

@@ -42,7 +42,7 @@ class OperatorGuidance:
         self._obey(NO_GUIDANCE)
         self._scenario = scenario
         self._proposed: Guidance | None = None
-        self._origin: Literal["llm", "operator"] | None = None
+        self._origin: Literal["llm", "phrases", "operator"] | None = None
         self._model: str | None = None
         self._failure: str | None = None
         self._doubts: list[str] = []
@@ -56,7 +56,8 @@ class OperatorGuidance:
             withdrawn: patterns of the names of orders in force that the note withdraws.
         """
         if self.status == "compiling":
-            self.status, self._proposed, self._origin, self._model = "proposed", guidance, "llm", model
+            self.status, self._proposed, self._model = "proposed", guidance, model
+            self._origin = "llm" if model else "phrases"
             self._doubts, self._withdrawn = list(doubts), list(withdrawn)
 
     def fail(self, reason: str, model: str | None) -> None:
@@ -96,7 +97,7 @@ class OperatorGuidance:
                 "answer", f"guidance is {self.status}: there is nothing to {answer.answer}; give `guidance` of your own"
             )
         elif answer.answer == "confirm":
-            note = self.note if self._origin == "llm" else None
+            note = self.note if self._origin != "operator" else None
             try:
                 self._change(self._with(self._proposed, self._withdrawn, replaces, step), step, note)
             except Impossible as error:
@@ -186,18 +187,21 @@ class OperatorGuidance:
             status=self.status,
             note=self.note,
             guidance=self._proposed,
-            in_words=None if self._proposed is None else self._proposed.in_words(),
+            in_words="No new order." if self._withdrawn and not waits else self._proposed and self._proposed.in_words(),
             obeyed_in_words=None if self.orders is None else self.orders.in_words(),
             origin=self._origin,
             model=self._model,
             failure=self._failure,
-            doubts=self._doubts,
+            doubts=[*self._doubts, *(["The orders that the note withdraws are not in force."] * self._futile())],
             **changed,
             begun=self._begun,
             ended=self._ended,
             orders=[*self._over, *self._in_force.values()],
             version=self.version,
         )
+
+    def _futile(self) -> bool:
+        return self.status == "proposed" and bool(self._withdrawn) and not self._matching(self._withdrawn)
 
     def _changes(self, proposed: Guidance) -> dict[str, list[str]]:
         """What a confirmation would change, each order in words."""

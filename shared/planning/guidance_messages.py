@@ -44,7 +44,9 @@ class GuidanceStatus(Wire):
     guidance: Guidance | None = Field(None, description="compiled from the note, or given by the operator")
     in_words: str | None = Field(None, description="the guidance in plain English, from the structure alone")
     obeyed_in_words: str | None = Field(None, description="the orders that are obeyed now, in plain English")
-    origin: Literal["llm", "operator"] | None = Field(None, description="the author of the structure")
+    origin: Literal["llm", "phrases", "operator"] | None = Field(
+        None, description="the author of the structure; `phrases`: the edge read the whole note, without the LLM"
+    )
     model: str | None = Field(None, description="the LLM that compiled the note")
     failure: str | None = Field(None, description="why the note could not be compiled")
     doubts: list[str] = Field([], description="what may be wrong with the LLM's reading; empty if it is certain")

@@ -11,6 +11,7 @@ import pytest
 from service.guidance.lettered_orders import STATIC
 from service.guidance.note_compiler import compile_note
 from service.guidance.note_orders import BadOrders
+from service.guidance.note_phrases import PhrasedNote
 from service.llm.answers import Completion, TokenPosition
 from service.llm.request_bodies import Rewriting
 from service.llm.server_pool import ServerPool
@@ -45,7 +46,7 @@ class Adapted:
 
 
 async def reading(llm: Adapted) -> Any:
-    return await compile_note(NOTE, PAPER, cast(ServerPool, llm))
+    return await compile_note(PhrasedNote(NOTE, PAPER, ()), PAPER, cast(ServerPool, llm))
 
 
 async def test_three_readings_with_other_letters_that_agree_have_no_doubt() -> None:
@@ -74,9 +75,10 @@ async def test_a_note_that_most_readings_find_unclear_is_refused() -> None:
 async def test_what_the_fleet_cannot_do_is_refused() -> None:
     with pytest.raises(Impossible, match="sensor 9 is unknown"):
         llm = cast(ServerPool, Adapted([RIGHT] * 3))
-        await compile_note(NOTE.replace("4", "9"), PAPER.model_copy(update={"sensors": 5}), llm)
+        few = PAPER.model_copy(update={"sensors": 5})
+        await compile_note(PhrasedNote(NOTE.replace("4", "9"), few, ()), few, llm)
 
 
 async def test_more_than_twenty_numbers_are_refused() -> None:
     with pytest.raises(BadOrders, match="more than 20"):
-        await compile_note("1 " * 21, PAPER, cast(ServerPool, Adapted([])))
+        await compile_note(PhrasedNote("1 " * 21, PAPER, ()), PAPER, cast(ServerPool, Adapted([])))

@@ -1,0 +1,214 @@
+"""The parts of an operator's note that code reads: withdrawals, single visits, ends of orders, and what is in no order.
+
+The orders' adapter knows no withdrawals, and few ends. ``note_phrases.toml`` has the phrases; the LLM reads the rest.
+"""
+
+import re
+import tomllib
+from collections.abc import Callable, Collection, Iterator, Mapping
+from datetime import datetime, timedelta
+from fnmatch import filter as matching
+from functools import partial
+from importlib.resources import files
+from typing import Any
+
+from service.guidance.lettered_orders import SEPARATOR, meaning
+from service.guidance.note_numbers import CARDINALS, ORDINALS, LetteredNote, Number, numbers_of
+from shared.planning.orders import NO_GUIDANCE, End, Guidance
+from shared.world.scenario import Scenario
+
+_TABLE = tomllib.loads(files("service.guidance").joinpath("note_phrases.toml").read_text(encoding="utf-8"))
+_STOP = re.compile(r"[.;!?](?=\s|$)")
+_CLAUSE = re.compile(r"(?:[^.,;:!?]|[.,:](?=\S))+?(?=[.,;:!?](?:\s|$)| and | but | - |$)")
+_VELOCITIES = ("m/s", "km/h", "mph", "kn")
+_SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
+
+
+def _pattern(phrase: str) -> re.Pattern[str]:
+    while (filled := re.sub(r"\{([a-zA-Z]+)\}", lambda part: _PARTS[part[1]], phrase)) != phrase:
+        phrase = filled
+    return re.compile(phrase)
+
+
+_PARTS: dict[str, str] = {**_TABLE["parts"], "words": "|".join([*CARDINALS[::-1], *ORDINALS])}
+_ROWS = {kind: [(row, [_pattern(p) for p in row["phrases"]]) for row in _TABLE[kind]] for kind in ("withdraw", "order")}
+_ENDS = {kind: [_pattern(phrase) for phrase in phrases] for kind, phrases in _TABLE["ends"].items()}
+_KINDS = ("conditional", "limited", "once", "times", "added")
+_PHRASES = {kind: [_pattern(phrase) for phrase in _TABLE[kind]["phrases"]] for kind in _KINDS}
+_Matches = Iterator[re.Match[str]]
+
+
+class PhrasedNote:
+    """A note without the phrases that code reads.
+
+    Attributes:
+        rest: the note in lower case, with spaces in place of these phrases.
+        withdrawn: patterns of the names of orders in force that end.
+
+    Args:
+        in_force: the names of the orders in force.
+    """
+
+    def __init__(self, note: str, scenario: Scenario, in_force: Collection[str]) -> None:
+        self.rest = self._lowered = note.lower()
+        self._scenario = scenario
+        self.withdrawn: list[str] = []
+        self._doubts: list[str] = []
+        self._once: dict[str, float] = {}
+        self._ends: list[tuple[re.Match[str], str, End | None]] = []
+        self._orders: list[tuple[str, re.Match[str]]] = []
+        for row, patterns in _ROWS["withdraw"]:
+            for match in self._taken(patterns, partial(self._withdraws, row, in_force)):
+                self.withdrawn += _names(row, match)
+        for match in self._taken(_PHRASES["once"]):
+            self._once |= {f"visit:{sensor}": 1 for sensor in _sensors(match["S"])}
+        for kind, patterns in _ENDS.items():
+            self._ends += [(match, kind, self._end(kind, match)) for match in self._taken(patterns)]
+        for match in self._taken(_PHRASES["times"]):
+            self._doubts.append(f"In no order: “{match[0].strip()}”.")
+        for _ in self._taken(_PHRASES["added"]):
+            pass
+        for row, patterns in _ROWS["order"]:
+            plain = self._taken(patterns, lambda match: not self._says("conditional", match))
+            self._orders += [(row["means"], match) for match in plain]
+
+    @property
+    def orders(self) -> bool:
+        """Whether code has read an order or a withdrawal."""
+        return bool(self.withdrawn or self._once or self._orders)
+
+    @property
+    def text(self) -> str:
+        """The rest as the LLM reads it."""
+        return re.sub(r"\s+(?=[.,;:!?]|$)|^(?:\W|and |then )+", "", " ".join(self.rest.split()))
+
+    @property
+    def is_read(self) -> bool:
+        """Whether the rest has nothing for the LLM to read."""
+        return self.orders and not numbers_of(self.rest) and not list(self._unread(self._read_orders().values, ()))
+
+    def completed(self, read: Guidance, numbers: Collection[float]) -> tuple[Guidance, list[str]]:
+        """The whole note's guidance, and doubts: what is in no order, and ends that no order can have.
+
+        Args:
+            read: the LLM's reading of the rest.
+            numbers: the numbers of the rest that its orders use.
+        """
+        own = self._read_orders()
+        values = {**read.values, **own.values, **self._once}
+        ends = {**read.ends, **{name: End(visited=int(name[6:])) for name in self._once}}
+        doubts = list(self._doubts)
+        for match, kind, end in self._ends:
+            names = [n for n in values if n not in self._once and self._in_sentence(n, values[n], match.start())]
+            for name in names if end is not None or kind == "visited" else ():
+                sensor = self._visited(match, name, values)
+                if (own := end if sensor is None else End(visited=sensor)) is not None:
+                    ends[name] = own
+            if kind != "open" and not any(name in ends for name in names):
+                doubts.append(f"No order ends by itself “{match[0].strip()}”: withdraw it then.")
+        doubts += [f"In no order: “{clause}”." for clause in self._unread(values, numbers)]
+        return Guidance.of(values, ends), doubts
+
+    def _taken(self, patterns: list[re.Pattern[str]], wanted: Callable[[re.Match[str]], bool] = bool) -> _Matches:
+        for pattern in patterns:
+            for match in filter(wanted, pattern.finditer(self.rest)):
+                self.rest = self.rest[: match.start()] + " " * len(match[0]) + self.rest[match.end() :]
+                yield match
+
+    def _says(self, kind: str, match: re.Match[str]) -> bool:
+        """Whether the sentence of a phrase has words of a kind."""
+        sentence = _STOP.split(self._lowered[: match.start()])[-1] + _STOP.split(self._lowered[match.start() :])[0]
+        return any(pattern.search(sentence) for pattern in _PHRASES[kind])
+
+    def _withdraws(self, row: Mapping[str, Any], in_force: Collection[str], match: re.Match[str]) -> bool:
+        known = not row.get("in_force") or any(matching(in_force, name) for name in _names(row, match))
+        return known and not self._says("conditional", match) and not self._says("limited", match)
+
+    def _read_orders(self) -> Guidance:
+        """The guidance of the plain orders; raises as :func:`meaning`."""
+        if not self._orders:
+            return NO_GUIDANCE
+        note = LetteredNote.of(self._lowered, 0)
+
+        def letters(match: re.Match[str], part: str) -> str:
+            begin, end = match.span(part)
+            found = [letter for letter, number in note.numbers.items() if begin <= number.begin < end]
+            spans = re.search(r"\d ?- ?\d| to | through ", match[part])
+            return ("-" if spans and len(found) == 2 else " ").join(found)
+
+        answer = [re.sub(r"\{(.)\}", lambda p, m=match: letters(m, p[1]), means) for means, match in self._orders]
+        return meaning(SEPARATOR.join(answer), note, self._scenario).guidance
+
+    def _end(self, kind: str, match: re.Match[str]) -> End | None:
+        if kind == "time":
+            return _clock(match)
+        if kind not in ("step", "through", "steps"):
+            return None
+        number = numbers_of(match["N"])[0]
+        if kind == "steps":
+            seconds = _SECONDS.get(number.unit or "", self._scenario.step_s) * number.value
+            return End(steps=max(1, round(seconds / self._scenario.step_s)))
+        return End(step=int(number.value) + (kind == "through"))
+
+    def _visited(self, match: re.Match[str], name: str, values: Mapping[str, float]) -> int | None:
+        """The sensor whose visit ends this order, where a visit does."""
+        if "S" not in match.re.groupindex:
+            return None
+        if match["S"]:
+            return _sensors(match["S"])[0]
+        sensors = {int(own.partition(":")[2]) for own in values if own.startswith("visit:")}
+        kind, _, number = name.partition(":")
+        return int(number) if kind == "visit" else sensors.pop() if len(sensors) == 1 else None
+
+    def _in_sentence(self, name: str, value: float, at: int) -> bool:
+        """Whether an order's numbers are not only in other sentences than the one at this place."""
+        sentence = len(_STOP.findall(self._lowered[:at]))
+        ends = [match.span() for match, _, _ in self._ends]
+        numbers = [n for n in numbers_of(self._lowered) if not any(begin <= n.begin < end for begin, end in ends)]
+        here = [n for n in numbers if len(_STOP.findall(self._lowered[: n.begin])) == sentence]
+        return _uses(name, value, here) or not _uses(name, value, numbers)
+
+    def _unread(self, values: Mapping[str, float], used: Collection[float]) -> Iterator[str]:
+        for clause in _CLAUSE.finditer(self.rest):
+            numbers = [n for n in numbers_of(clause[0]) if clause[0][n.begin : n.end] not in ("one", "first", "second")]
+            asked = [kind for kind, words in _TABLE["asks"].items() if re.search(words, clause[0])]
+            lost = numbers and not all(number.value in used for number in numbers)
+            ignored = not numbers and any(not any(name.startswith(kind) for name in values) for kind in asked)
+            if lost or ignored:
+                yield " ".join(clause[0].split())
+
+
+def _uses(name: str, value: float, numbers: list[Number]) -> bool:
+    kind, _, number = name.partition(":")
+    if kind in ("visit", "weight"):
+        return any(one.unit is None and one.value == int(number) for one in numbers)
+    return any(one.unit in _VELOCITIES or (one.unit is None and one.value == value) for one in numbers)
+
+
+def _names(row: Mapping[str, Any], match: re.Match[str]) -> list[str]:
+    sensors = _sensors(match["S"]) if "S" in match.re.groupindex else [0]
+    return [name.format(sensor) for name in row["names"] for sensor in sensors]
+
+
+def _sensors(text: str) -> list[int]:
+    """The sensors of a list such as ``3, 5 and 7-9``."""
+    sensors: list[int] = []
+    end = 0
+    for number in numbers_of(text):
+        first = (
+            sensors[-1] + 1 if sensors and re.search(r"-|to|through", text[end : number.begin]) else int(number.value)
+        )
+        sensors += range(first, min(int(number.value), first + 999) + 1)
+        end = number.end
+    return sensors
+
+
+def _clock(match: re.Match[str]) -> End | None:
+    """The next time of this kind, in the edge's time zone."""
+    hour, half = int(match["hour"]), match["half"] or match["half2"] or ""
+    hour = hour % 12 + 12 * half.startswith("p") if half[:1] in ("a", "p") else hour
+    if hour > 24 or int(match["minute"] or 0) > 59:
+        return None
+    now = datetime.now().astimezone()
+    time = now.replace(hour=hour % 24, minute=int(match["minute"] or 0), second=0, microsecond=0)
+    return End(time=time if time > now else time + timedelta(days=1))
