@@ -137,9 +137,11 @@ def _guidance(mission: Mission) -> dict[str, Any]:
     """The operator's note, the guidance from it, the orders in force, and the visits that are due, with his names."""
     visits, confirmed, names = mission.records.visits, mission.guidance.confirmed, mission.spec.names
     report = mission.guidance.report(mission.mission_id).model_dump(exclude={"mission_id"})
-    lists = ("begins", "stays", "ends", "ends_if_replaced", "begun", "ended")
-    words = {key: [with_names(one, names) for one in report[key]] for key in lists}
-    words |= {key: report[key] and with_names(report[key], names) for key in ("in_words", "obeyed_in_words")}
+    words: dict[str, Any] = {}
+    for key in ("in_words", "obeyed_in_words"):
+        words[key] = report[key] and with_names(report[key], names)
+    for key in ("begins", "stays", "ends", "ends_if_replaced", "begun", "ended"):
+        words[key] = [with_names(one, names) for one in report[key]]
     in_force = [order for order in report["orders"] if order["until"] is None]
     return {
         **report,
