@@ -188,5 +188,5 @@ def test_the_embedded_llm_decides_and_draws_at_random_stand_beside_it(tmp_path: 
     assert result.model == "SmolLM2-135M-Instruct.Q8_0"
     assert not any("not the LLM's" in note for note in result.notes)
     assert json.loads((tmp_path / "llm-models" / "results.json").read_text())["command"] == (
-        f"python -m lab experiment llm-models --steps 1 --seeds 1 --out {tmp_path}"
+        "python -m lab experiment llm-models --steps 1 --seeds 1"
     )
