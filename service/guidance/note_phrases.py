@@ -175,7 +175,7 @@ class PhrasedNote:
             lost = numbers and not all(number.value in used for number in numbers)
             ignored = not numbers and any(not any(name.startswith(kind) for name in values) for kind in asked)
             if lost or ignored:
-                yield " ".join(clause[0].split())
+                yield " ".join(re.sub(r"^\W*(?:and|but|then)\b", "", clause[0]).split())
 
 
 def _uses(name: str, value: float, numbers: list[Number]) -> bool:

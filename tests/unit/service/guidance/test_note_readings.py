@@ -19,7 +19,7 @@ from shared.planning.orders import Guidance, Impossible, SensorWish
 from shared.world.scenario import SCENARIOS
 
 PAPER = SCENARIOS["paper"]
-NOTE = "Sensor 4 every 3 steps, and not over 9 m/s."
+NOTE = "Sensor 4 every 3 steps, and nobody exceeds 9 m/s."
 MEANT = Guidance(sensors=[SensorWish(sensor_id=4, visit_every=3)], max_velocity=9)
 RIGHT, OTHER = "visit {0} every {1}; max {2}", "visit {0} every {1}; min {2}"
 
