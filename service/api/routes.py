@@ -196,9 +196,9 @@ async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStat
     tags=["missions"],
 )
 async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: TheEngine) -> GuidanceStatus:
-    """Confirm or reject the proposed guidance, give a structure or a new note, or withdraw the orders in force.
+    """Confirm or reject the proposed guidance, give a structure or a new note, or withdraw orders in force.
 
-    Only confirmed orders are obeyed. The status's `ends` lists the orders in force that a confirmation ends.
+    Only confirmed orders are obeyed. They are added, unless they replace all; the status shows what either would end.
     """
     mission = await engine.missions.get(mission_id)
     engine.missions.refuse_if_failing("answer")

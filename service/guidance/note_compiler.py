@@ -190,7 +190,7 @@ class NoteCompiler:
         except (BadOrders, Impossible, NoDecision) as error:
             reason = str(error)
         except TimeoutError:
-            reason = f"no answer in {_TIMEOUT_S:g} s"
+            reason = "the LLM did not answer in time"
         except Exception as error:
             log.exception("mission %s: the note was not compiled", mission.mission_id)
             reason = f"{type(error).__name__}: see the log"
