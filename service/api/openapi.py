@@ -10,7 +10,7 @@ from fastapi.openapi.utils import get_openapi
 
 from service.api.authentication import is_open, scope_of
 from service.api.problem_details import CONTENT_TYPE, documented
-from shared.wire.problem import Problem
+from shared.wire.problem import Fault, Problem
 from shared.world.scenario import SCENARIOS
 
 JSON = "application/json"
@@ -43,7 +43,7 @@ def problem(status: int) -> Example:
         title=HTTPStatus(status).phrase,
         status=status,
         detail=f"{field}: {fault}" if field else fault,
-        errors=[{"field": field, "problem": fault}] if field else [],
+        errors=[Fault(field=field, problem=fault)] if field else [],
         owner="http://edge-2:8000" if status == HTTPStatus.MISDIRECTED_REQUEST else None,
     )
     return whole.model_dump(mode="json")
@@ -54,7 +54,8 @@ def schema_of(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         schema = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
         schemas = schema["components"]["schemas"]
-        schemas["Problem"] = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        problem_schema = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        schemas |= problem_schema.pop("$defs") | {"Problem": problem_schema}
         for unused in ("HTTPValidationError", "ValidationError"):
             schemas.pop(unused, None)
         schema["components"]["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer", "description": _KEYS}}

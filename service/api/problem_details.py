@@ -16,7 +16,7 @@ from service.errors import Misdirected, Refused, Unavailable
 from shared.kit.validation_messages import problem_of
 from shared.planning.guidance_messages import GuidanceAnswer
 from shared.planning.orders import End, Guidance, SensorWish
-from shared.wire.problem import Problem
+from shared.wire.problem import Fault, Problem
 from shared.wire.readings import ReadingsRequest, SensorReading
 from shared.wire.schemas import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, PromptStyle, SensorColumns
 from shared.world.scenario import Scenario
@@ -44,9 +44,8 @@ def problem_response(
     status: int, detail: str, errors: Sequence[dict[str, str]] = (), kind: str = "about:blank", owner: str | None = None
 ) -> Response:
     """An ``application/problem+json`` response of the type ``kind``, which never repeats the request's content."""
-    body = Problem(
-        type=kind, title=HTTPStatus(status).phrase, status=status, detail=detail, errors=list(errors), owner=owner
-    )
+    faults = [Fault(**error) for error in errors]
+    body = Problem(type=kind, title=HTTPStatus(status).phrase, status=status, detail=detail, errors=faults, owner=owner)
     return Response(body.model_dump_json(), status_code=status, media_type=CONTENT_TYPE)
 
 

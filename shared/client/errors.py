@@ -27,12 +27,12 @@ class EdgeRefused(EdgeError):
         self.detail = detail = problem.detail
         self.errors = problem.errors
         self.type = problem.type
-        fields = "; ".join(": ".join(error.values()) for error in self.errors)
+        fields = "; ".join(f"{error.field}: {error.problem}" for error in self.errors)
         super().__init__(f"{url} refused with {status}: {detail}" + (f" ({fields})" if fields else ""))
 
     def concerns(self, field: str) -> bool:
         """Whether the problem's fields or detail name ``field``."""
-        return field in self.detail or any(field in value for error in self.errors for value in error.values())
+        return field in self.detail or any(field in error.field or field in error.problem for error in self.errors)
 
     @property
     def mission_unknown(self) -> bool:

@@ -6,6 +6,13 @@ from pydantic import BaseModel, Field
 INCOMPLETE = "urn:aicvds:problem:incomplete"
 
 
+class Fault(BaseModel):
+    """A field of the request at fault, and its problem in words."""
+
+    field: str
+    problem: str
+
+
 class Problem(BaseModel):
     """RFC 9457 ``application/problem+json``; ``errors`` names each field at fault."""
 
@@ -13,7 +20,7 @@ class Problem(BaseModel):
     title: str
     status: int
     detail: str
-    errors: list[dict[str, str]] = []
+    errors: list[Fault] = []
     owner: str | None = Field(
         None,
         exclude_if=lambda value: value is None,

