@@ -87,7 +87,7 @@ def test_nothing_contradicts_the_records(visit: Open, edge: str, tmp_path: Path,
     assert ("Tokens saved" in found) == (mode in ("guided", "llm"))
     for card in page.locator("#feed .by").all_inner_texts():
         assert any(card.startswith(WORDS[source]) for source in sources if source != "onboard")
-    assert f"mode {mode}" in page.locator("#about").text_content()
+    expect(page.locator("#about")).to_contain_text(f"mode {mode}")
 
 
 def check_report(records: Records, sources: Counter[str], failed: int) -> None:
