@@ -70,6 +70,7 @@ export class Charts {
 
   #draw() {
     const steps = [...this.mission.steps].filter(([, s]) => s.count > 0).sort((a, b) => a[0] - b[0]);
+    at("loss").closest("section").hidden = steps.length === 0;
     if (!steps.length) return;
     for (const [name, chart] of Object.entries(CHARTS)) {
       // A prompt that no LLM reads costs and saves nothing.

@@ -54,7 +54,8 @@ export class Feed {
   update(mission) {
     this.mission = mission;
     const newest = this.#chosen(mission);
-    at("feed-none").hidden = newest.length > 0 || mission.decisions.size === 0;
+    at("feed-none").hidden = newest.length > 0;
+    say(at("feed-none"), mission.decisions.size ? "None of the newest decisions is such a one." : "None yet.");
     const wanted = new Set(newest.map((decision) => decision.answer.decision_id));
     for (const [id, item] of this.items) {
       if (!wanted.has(id) && !item.element.contains(document.activeElement)) {

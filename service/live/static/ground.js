@@ -33,7 +33,7 @@ export function titles(mission, view) {
   for (const { kind, name, points } of mission.map) {
     if (name === null || told.has(`${kind}${name}`)) continue;
     const inside = points.map(([x, y]) => [view.x(x), view.y(y)]).filter(([x, y]) => x > 0 && y > 0 && x < view.width && y < view.height);
-    const spots = kind === "line" ? [0.5, 0.25, 0.75].map((share) => inside[Math.floor(share * (inside.length - 1))]) : [middle(inside), ...inside];
+    const spots = kind === "fence" ? inside.flatMap(([x, y]) => [[x + 40, y - 10], [x - 40, y - 10], [x + 40, y + 10], [x - 40, y + 10]]) : kind === "line" ? [0.5, 0.25, 0.75].map((share) => inside[Math.floor(share * (inside.length - 1))]) : [middle(inside), ...inside];
     const text = short(name);
     const spot = best(view, spots.filter(Boolean).flatMap(([x, y]) => [[x, y], [x, y - 14], [x, y + 14]]), text, 0.05);
     if (!spot) continue;
@@ -43,8 +43,9 @@ export function titles(mission, view) {
   return made;
 }
 
-/** Of the places of a text's middle the one that covers least; null where each covers more than a share of the text. */
-export function best(view, spots, text, share) {
+/** Of the places of a text's middle the one that covers least; null where each covers more than a share of the text.
+ * `stays`: whether other texts are to keep clear of it. */
+export function best(view, spots, text, share, stays = true) {
   const [w, h] = [LETTER_PX * text.length + 4, LABEL_PX];
   let [found, least] = [null, share * w * h];
   for (const [x, y] of spots) {
@@ -54,7 +55,7 @@ export function best(view, spots, text, share) {
     if (cost < least || (cost === 0 && !found)) [found, least] = [[x, y, box], cost];
     if (cost === 0) break;
   }
-  if (found) view.boxes.push(found[2]);
+  if (found && stays) view.boxes.push(found[2]);
   return found;
 }
 

@@ -37,7 +37,7 @@ export class MissionMap {
     const sensors = draw("g", {});
     const uavs = draw("g", {});
     const { places } = mission;
-    this.radius = places.length <= 30 ? 11 : places.length <= 150 ? 8 : places.length <= 1000 ? 4 : 2.5;
+    this.radius = (places.length <= 30 ? 11 : places.length <= 150 ? 8 : places.length <= 1000 ? 4 : 2.5) * (this.width < 500 ? 0.75 : 1);
     const r = this.radius;
     this.boxes = places.flatMap((place) => (place[0] === null ? [] : [[this.x(place[0]) - r, this.y(place[1]) - r, 2 * r, 2 * r]]));
     const under = ground(mission, this);
@@ -121,14 +121,23 @@ export class MissionMap {
 
   #uav(id) {
     const body = draw("path", { class: "craft", d: "M0-11L8 8 0 4-8 8z" });
+    const label = draw("text", { class: "label" }, short(this.mission.uav(id), 11));
     const attributes = { class: "mark uav", id: `uav-${id}`, role: "button", tabindex: -1 };
-    const group = draw("g", attributes, draw("circle", { class: "hit", r: 16 }), body, draw("text", { class: "label", x: 11, y: -7 }, short(this.mission.uav(id), 11)));
+    const group = draw("g", attributes, draw("circle", { class: "hit", r: 16 }), body, label);
     const link = draw("line", { class: "link" });
     this.uavs.append(group);
     this.links.append(link);
-    const mark = { kind: "uav", id, group, body, link, text: "" };
+    const mark = { kind: "uav", id, group, body, label, link, text: "" };
     this.marks.set(group.id, mark);
     return mark;
+  }
+
+  /** Put a UAV's label beside it where it covers the fewest sensors and names. */
+  #aside(label, x, y) {
+    const text = label.textContent;
+    const aside = 14 + 3.6 * text.length;
+    const [bestX, bestY] = best(this, [[x + aside, y - 8], [x - aside, y - 8], [x + aside, y + 10], [x - aside, y + 10], [x, y - 20], [x, y + 22]], text, Infinity, false) ?? [x, y - 20];
+    set(label, { x: px(bestX - x), y: px(bestY - y + 4) });
   }
 
   #fly(mission, uavs, newest, step) {
@@ -139,6 +148,7 @@ export class MissionMap {
       if (place !== mark.place) {
         mark.place = place;
         set(mark.group, { transform: place });
+        this.#aside(mark.label, this.x(position[0]), this.y(position[1]));
       }
       const heading = last?.before ? Math.atan2(position[0] - last.before[0], position[1] - last.before[1]) : null;
       if (heading !== null) set(mark.body, { transform: `rotate(${Math.round((heading * 180) / Math.PI)})` });
