@@ -25,15 +25,6 @@ _ENDED_S, _SILENT_S = 600.0, 30.0
 
 
 @dataclass(slots=True)
-class UavReport:
-    """A UAV's newest report: its monotonic time, s, and what it said of the UAV's battery, percent, and height."""
-
-    at: float
-    battery: float | None
-    height_m: float | None
-
-
-@dataclass(slots=True)
 class Watched:
     """Observations of one mission since the edge started.
 
@@ -42,7 +33,7 @@ class Watched:
             decision of the step. Sensors of which nothing was ever heard do not count.
         silent: by sensor, the newest step in which a UAV was within its radio radius and did not hear it.
         decided_at: the monotonic time of the last decision, seconds; None before the first.
-        uavs: the newest report of each UAV.
+        uavs: of each UAV's newest report the monotonic time, s, and its battery, percent, and height, m, if it said so.
         began: the newest step, and the monotonic time of its first report.
         step_took_s: seconds between the first reports of the newest two consecutive steps; None before them.
     """
@@ -50,14 +41,14 @@ class Watched:
     full: BoundedDict[int, float] = field(default_factory=lambda: BoundedDict(_MOST_STEPS))
     silent: dict[int, int] = field(default_factory=dict)
     decided_at: float | None = None
-    uavs: dict[int, UavReport] = field(default_factory=dict)
+    uavs: dict[int, tuple[float, float | None, float | None]] = field(default_factory=dict)
     began: tuple[int, float] = (-2, 0.0)
     step_took_s: float | None = None
 
     @property
     def batteries(self) -> dict[int, float]:
         """By UAV, percent of its own battery, where that was reported."""
-        return {uav: one.battery for uav, one in self.uavs.items() if one.battery is not None}
+        return {uav: percent for uav, (_, percent, _) in self.uavs.items() if percent is not None}
 
     def totals(self) -> dict[str, Any]:
         """The page's numbers: sums over the steps, the silent sensors, and the seconds since the last decision."""
@@ -79,7 +70,7 @@ class FleetWatch:
         watched = self.of(mission.mission_id)
         watched.decided_at = time.monotonic()
         now = time.monotonic()
-        watched.uavs[uav.uav_id] = UavReport(now, uav.battery_percent, uav.height_m)
+        watched.uavs[uav.uav_id] = now, uav.battery_percent, uav.height_m
         if step > watched.began[0]:
             watched.step_took_s = now - watched.began[1] if step == watched.began[0] + 1 else watched.step_took_s
             watched.began = step, now

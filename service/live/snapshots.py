@@ -118,8 +118,8 @@ def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
 
 def _uav(mission: Mission, watched: Watched, uav: int) -> dict[str, Any]:
     """A UAV's newest report, and where its decision brings it by the next waypoint."""
-    belief, report = mission.belief, watched.uavs.get(uav)
-    last = belief.uavs[uav]
+    belief, last = mission.belief, mission.belief.uavs[uav]
+    at, battery, height_m = watched.uavs.get(uav, (None, None, None))
     goal = None
     if last.action is not None:
         goal = last.ahead(belief.trajectory(uav), belief.drift, [last.action[1] * mission.scenario.step_s])[0]
@@ -127,9 +127,9 @@ def _uav(mission: Mission, watched: Watched, uav: int) -> dict[str, Any]:
         "step": last.step,
         "position": last.position,
         "next": None if goal is None else np.round(goal, 1).tolist(),
-        "battery": report and report.battery,
-        "height_m": report and report.height_m,
-        "heard_s": None if report is None else round(time.monotonic() - report.at, 1),
+        "battery": battery,
+        "height_m": height_m,
+        "heard_s": None if at is None else round(time.monotonic() - at, 1),
     }
 
 

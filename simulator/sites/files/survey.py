@@ -156,6 +156,9 @@ def _text(name: str | int) -> str:
     return name.strip() if isinstance(name, str) else str(name) if abs(name) < 10**64 else ""
 
 
+Drawn = tuple[Literal["line", "area"], str | None, list[Point]]
+
+
 @dataclass
 class Survey:
     """The content of a ``world.geojson``. Points are longitude and latitude, degrees.
@@ -167,7 +170,7 @@ class Survey:
         pipeline: polylines, for pictures.
         fences: fence by the feature's label; the radius of a circle is in metres.
         sensor_names, uav_names: for people, in the order of the sensors and trajectories.
-        drawn: kind, name and points of the background, and of the pipeline's named sections.
+        background, sections: kind, name and points of lines and areas, and of the pipeline's named parts.
     """
 
     sensors: dict[str, Point] = field(default_factory=dict)
@@ -176,7 +179,8 @@ class Survey:
     fences: dict[str, Fence] = field(default_factory=dict)
     sensor_names: list[str | None] = field(default_factory=list)
     uav_names: list[str | None] = field(default_factory=list)
-    drawn: list[tuple[Literal["line", "area"], str | None, list[Point]]] = field(default_factory=list)
+    background: list[Drawn] = field(default_factory=list)
+    sections: list[Drawn] = field(default_factory=list)
 
 
 def read_survey(path: Path) -> Survey:
@@ -310,12 +314,12 @@ def _add(survey: Survey, label: str, feature: _Feature) -> None:
         if len(survey.pipeline) > MAX_PARTS:
             raise ValueError(f"the pipeline has more than {MAX_PARTS:,} parts; join them")
         if feature.title is not None:
-            survey.drawn += (("line", feature.title, part) for part in feature.parts)
+            survey.sections += (("line", feature.title, part) for part in feature.parts)
     elif role == "background":
         if geometry == "Point":
             raise ValueError("the background is a LineString, MultiLineString or Polygon, not a Point")
         kind: Literal["line", "area"] = "area" if geometry == "Polygon" else "line"
-        survey.drawn += ((kind, feature.title, part) for part in feature.parts)
+        survey.background += ((kind, feature.title, part) for part in feature.parts)
     else:
         survey.fences[label] = _fence(survey, role, feature)
 

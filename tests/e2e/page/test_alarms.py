@@ -16,7 +16,7 @@ from service.api.app import create_app
 from service.config.settings import Settings
 from service.mission.mission import Mission
 from shared.wire.schemas import UavState
-from tests.e2e.page.conftest import HOSTILE, Open, Report, violations
+from tests.e2e.page.conftest import HOSTILE, REFUSED, Open, Report, violations
 from tests.support.running import serving
 from tests.support.stored_missions import running
 from tests.support.waiting import PATIENCE_S
@@ -75,7 +75,8 @@ def test_a_late_decision_and_a_store_that_fails_are_alarms(
     with running(path, create_on_decide="on") as (client, _):
         decided = client.post("/decide", json=report(mission_id="failing", deadline_ms=60_000))
         assert decided.json()["stored"]
-        page = visit(f"{client.base_url}?mission=failing")
+        # The page asks whether the edge is ready, and it is not: 503.
+        page = visit(f"{client.base_url}?mission=failing", expected=REFUSED)
         alarms = page.locator("#alarm-list")
         expect(alarms).to_contain_text("Full within 2 steps")
         expect(alarms).not_to_contain_text(re.compile("Store fails|Deadline missed"))
