@@ -65,6 +65,20 @@ def test_only_batteries_that_were_reported_are_low() -> None:
     assert found(fleet) == {"sensor_battery": {2: None}}
 
 
+def test_a_uavs_own_battery_is_an_alarm_as_long_as_its_newest_report_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    monkeypatch.setattr("service.live.fleet_watch.time", clock)
+    fleet, watch = mission(), FleetWatch()
+    for step, percent in enumerate((25.0, 24.9, None)):
+        fly(fleet, step)
+        watch.decided(fleet, uav(step=step).model_copy(update={"battery_percent": percent}), step)
+        clock.ahead_s += 10.0
+        seen = watch.of("test")
+        low = alarms(fleet, fleet.deadlines(), seen.batteries)["uav_battery"]
+        assert (low, watch.alarms([fleet])["uav_battery"]) == (({0: None}, 1) if percent == 24.9 else ({}, 0))
+    assert seen.step_took_s == pytest.approx(10.0, abs=1.0)
+
+
 def test_missions_that_fly_now_count_and_silent_ones_have_lost_their_uavs(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     monkeypatch.setattr("service.live.fleet_watch.time", clock)
