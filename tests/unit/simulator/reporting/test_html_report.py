@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shared.wire.names import Names
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.flying.flight import fly
 from simulator.flying.pilots import LocalPilot
@@ -263,3 +265,24 @@ def test_figures_are_written_for_print(tmp_path: Path) -> None:
     for again in (figures.deciders(flown.decisions), figures.losses({"aic_vds": flown.tally}, policy_labels(summary))):
         for path in again.write(tmp_path):
             assert path.read_bytes() == (tmp_path / "figures" / path.name).read_bytes()
+
+
+def test_names_are_in_tables_figures_and_playback_and_none_is_markup(flight: Flight, tmp_path: Path) -> None:
+    names = Names(sensors=[EVIL, *(f"kp-{number}.5" for number in range(1, 10))], uavs=["north", None, EVIL])
+    summary = summary_of(flight, None).model_copy(update={"names": names})
+    costly = [decision(cost=2.0, sensor_id=sensor, uav_id=sensor) for sensor in range(3)]
+    tallies = {"aic_vds": flight.tally}
+    path = tmp_path / "report.html"
+    write_report(path, summary, flight.scenario, costly, tallies, flight.sensor_xy, flight.track)
+    text = path.read_text(encoding="utf-8")
+    assert EVIL not in text and "&lt;script&gt;alert" in text
+    assert 'data-label="UAV">north<' in text and 'data-label="sensor">kp-1.5' in text
+    # A name is at most a dozen letters in a figure, and a UAV without one has its number.
+    assert 'data-label="UAV">1<' in text
+    assert re.search(r"<!-- kp-1\.5 -->|>kp-1\.5<", (tmp_path / "figures" / "visits.svg").read_text(encoding="utf-8"))
+    played = json.loads(re.search(r'id="playback-data">(.*?)</script>', text)[1])  # type: ignore[index]
+    assert played["names"]["sensors"][:2] == [EVIL, "kp-1.5"]
+
+
+def test_a_world_without_names_has_ids(flight: Flight) -> None:
+    assert 'data-label="sensor">0' in page(flight, decisions=[decision(cost=2.0)])
