@@ -255,6 +255,6 @@ async def _rewrite_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteR
             log.debug("note, attempt %d: %r: %s", attempt, text[:80], error)
             faults.append(error)
             continue
-        numbers = {float(part) for name, value in guidance.values.items() for part in (value, *name.split(":")[1:])}
+        numbers = {*guidance.values.values(), *(float(name.split(":")[1]) for name in guidance.values if ":" in name)}
         return NoteReading(guidance, (_NOT_JUDGED,), frozenset(numbers))
     raise faults[0]

@@ -102,8 +102,8 @@ class PhrasedNote:
             names = [n for n in values if n not in self._once and self._in_sentence(n, values[n], match.start())]
             for name in names if end is not None or kind == "visited" else ():
                 sensor = self._visited(match, name, values)
-                if (own := end if sensor is None else End(visited=sensor)) is not None:
-                    ends[name] = own
+                if (its := end if sensor is None else End(visited=sensor)) is not None:
+                    ends[name] = its
             if kind != "open" and not any(name in ends for name in names):
                 doubts.append(f"No order ends by itself “{match[0].strip()}”: withdraw it then.")
         doubts += [f"In no order: “{clause}”." for clause in self._unread(values, numbers)]
@@ -136,7 +136,10 @@ class PhrasedNote:
             spans = re.search(r"\d ?- ?\d| to | through ", match[part])
             return ("-" if spans and len(found) == 2 else " ").join(found)
 
-        answer = [re.sub(r"\{(.)\}", lambda p, m=match: letters(m, p[1]), means) for means, match in self._orders]
+        answer = []
+        for means, match in self._orders:
+            parts = {part: letters(match, part) for part in match.re.groupindex if f"{{{part}}}" in means}
+            answer.append(means.format_map(parts))
         return meaning(SEPARATOR.join(answer), note, self._scenario).guidance
 
     def _end(self, kind: str, match: re.Match[str]) -> End | None:

@@ -182,12 +182,15 @@ class OperatorGuidance:
         """The body of ``GET /missions/{id}/guidance``."""
         waits = self._proposed if self.status != "confirmed" else None
         changed = {} if waits is None else self._changes(waits)
+        in_words = None if self._proposed is None else self._proposed.in_words()
+        if self._withdrawn and not self._proposed:
+            in_words = "No new order."
         return GuidanceStatus(
             mission_id=mission_id,
             status=self.status,
             note=self.note,
             guidance=self._proposed,
-            in_words="No new order." if self._withdrawn and not waits else self._proposed and self._proposed.in_words(),
+            in_words=in_words,
             obeyed_in_words=None if self.orders is None else self.orders.in_words(),
             origin=self._origin,
             model=self._model,

@@ -12,9 +12,7 @@ import pytest
 
 from service.api.app import create_app
 from service.config.settings import Settings
-from tests.support.running import serving
-from tests.support.stub_llm import wait_for
-from tests.support.waiting import PATIENCE_S
+from tests.integration.service.llm.test_embedded import ready
 
 # A busy machine may need minutes for the three readings of a note.
 pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
@@ -26,14 +24,9 @@ VISIT, LIMIT = "Visit sensor 4 at least once in every 3 steps.", "Never fly fast
 
 @pytest.fixture(scope="module")
 def client() -> Iterator[httpx.Client]:
-    with (
-        pytest.MonkeyPatch.context() as patient,
-        serving(create_app(Settings(mode="llm", deadline_ms=60_000))) as url,
-        httpx.Client(base_url=url, timeout=PATIENCE_S) as client,
-    ):
+    with pytest.MonkeyPatch.context() as patient, ready(create_app(Settings(mode="llm", deadline_ms=60_000))) as client:
         for limit in ("_ANSWER_S", "_TIMEOUT_S"):
             patient.setattr(f"service.guidance.note_compiler.{limit}", 900.0)
-        wait_for(client, "ready")
         yield client
 
 
