@@ -164,6 +164,9 @@ class Guidance(Received):
             if wish.sensor_id >= scenario.sensors:
                 known = f"there are {scenario.sensors}, from 0"
                 raise Impossible(f"sensors[{row}].sensor_id", f"sensor {wish.sensor_id} is unknown: {known}")
+        for name, end in self.ends.items():
+            if end.visited is not None and end.visited >= scenario.sensors:
+                raise Impossible(f"ends.{name}.visited", f"sensor {end.visited} is unknown")
         named = {"min_velocity": self.min_velocity, "max_velocity": self.max_velocity}
         named |= {f"forbidden_velocities[{row}]": level for row, level in enumerate(self.forbidden_velocities)}
         for name, level in named.items():

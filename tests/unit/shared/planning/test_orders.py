@@ -33,6 +33,7 @@ def test_guidance_that_asks_for_nothing_is_false() -> None:
         (Guidance(sensors=[SensorWish(sensor_id=1), SensorWish(sensor_id=10, weight=2)]), "sensors[1].sensor_id"),
         (Guidance(min_velocity=9, max_velocity=8), "forbidden_velocities"),
         (Guidance(forbidden_velocities=list(range(15))), "forbidden_velocities"),
+        (Guidance(max_velocity=9, ends={"max_velocity": End(visited=10)}), "ends.max_velocity.visited"),
     ],
 )
 def test_what_a_fleet_cannot_obey_is_named(guidance: Guidance, field: str) -> None:
