@@ -17,6 +17,7 @@ from shared.world.scenario import Scenario
 STATIC = "Orders of a note."
 SEPARATOR = "; "
 NOTHING, UNCLEAR, MOVE, ALL, OTHERS = "nothing", "unclear", "move", "all", "others"
+PARTLY = "A part of the note is unclear, and is in no order"
 _MOST_ORDERS = 8
 _METRES_A_SECOND = {None: 1.0, "m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "kn": 0.514444}
 _SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
@@ -96,7 +97,7 @@ class _Orders:
             MOVE: lambda _: self._order("avoid:0", 0),
             "until": self._until,
             "for": lambda words: self._ended(End(steps=self._period(words[0]))),
-            UNCLEAR: lambda _: self.doubts.append("A part of the note is unclear, and is in no order."),
+            UNCLEAR: lambda _: self.doubts.append(PARTLY),
         }
         write = writers.get(kind)
         if write is None or (not words and kind not in (MOVE, UNCLEAR)):

@@ -21,7 +21,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from service.guidance.lettered_orders import STATIC, NoteReading, grammar, meaning
+from service.guidance.lettered_orders import PARTLY, STATIC, NoteReading, grammar, meaning
 from service.guidance.note_numbers import LetteredNote
 from service.guidance.note_orders import INSTRUCTION, BadOrders, parse_orders, similar_examples
 from service.guidance.note_phrases import PhrasedNote
@@ -236,7 +236,9 @@ async def compile_note(note: PhrasedNote, scenario: Scenario, llm: ServerPool) -
     guidance, doubts = note.completed(reading.guidance, reading.numbers)
     guidance.check(scenario)
     log.info("note compiled in %.1f s", time.monotonic() - started)
-    return NoteReading(guidance, (*reading.doubts, *doubts))
+    if PARTLY in reading.doubts and not doubts:
+        doubts = [f"{PARTLY}: “{note.text}”."]
+    return NoteReading(guidance, (*(doubt for doubt in reading.doubts if doubt != PARTLY), *doubts))
 
 
 async def _rewrite_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReading:

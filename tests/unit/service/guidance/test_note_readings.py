@@ -67,6 +67,24 @@ async def test_an_unlikely_reading_has_a_doubt() -> None:
     assert (await reading(Adapted([RIGHT] * 3, probability=0.9))).doubts == ("The LLM is not sure of this reading.",)
 
 
+async def test_a_part_that_the_llm_finds_unclear_is_quoted() -> None:
+    unclear = f"{RIGHT}; unclear"
+    assert (await reading(Adapted([unclear] * 3))).doubts == (
+        "A part of the note is unclear, and is in no order: “sensor 4 every 3 steps, and nobody exceeds 9 m/s.”.",
+    )
+    # Where code finds the words that are in no order, it quotes just these.
+    more = PhrasedNote(f"{NOTE[:-1]}, and be careful.", PAPER, ())
+    found = await compile_note(more, PAPER, cast(ServerPool, Adapted([unclear] * 3)))
+    assert (found.guidance, found.doubts) == (MEANT, ("In no order: “be careful”.",))
+
+
+async def test_what_code_has_read_is_proposed_beside_what_is_unclear() -> None:
+    note = PhrasedNote("Cancel all orders, and Kim looks after sensor 4.", PAPER, ("visit:4",))
+    found = await compile_note(note, PAPER, cast(ServerPool, Adapted(["unclear"] * 3)))
+    assert (note.withdrawn, found.guidance) == (["*"], Guidance())
+    assert found.doubts[0].startswith("In no order: “kim looks after sensor 4.”: the note is unclear")
+
+
 async def test_a_note_that_most_readings_find_unclear_is_refused() -> None:
     with pytest.raises(BadOrders, match="is unclear"):
         await reading(Adapted(["unclear", RIGHT, "unclear"]))
