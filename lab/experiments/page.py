@@ -140,8 +140,13 @@ def _drawn(result: Result, folder: Path) -> list[tuple[Figure, Path]]:
 
 
 def shown(result: Result) -> list[Figure]:
-    """The figure on the page: the first without curves if there is one, for curves of many schemes hide each other."""
-    return sorted(result.figures, key=lambda figure: figure.kind == "curves")[:1]
+    """The figure on the page: the first without curves if there is one, for curves of many schemes hide each other.
+
+    A sweep needs two schemes at least.
+    """
+    swept = result.schemes.keys() & (result.sweep.at if result.sweep else {}).keys()
+    drawn = [figure for figure in result.figures if figure.kind != "sweep" or len(swept) > 1]
+    return sorted(drawn, key=lambda figure: figure.kind == "curves")[:1]
 
 
 def render_page(results: Mapping[str, Result], drawn: Mapping[str, Sequence[tuple[Figure, Path]]], folder: Path) -> str:
@@ -155,7 +160,7 @@ def render_page(results: Mapping[str, Result], drawn: Mapping[str, Sequence[tupl
     often = Counter(note for result in results.values() for note in result.notes)
     judged = {
         "the LLM of `--llm`": claims.judge(results),
-        "the LLM with its adapter": claims.judge_with_adapter(results),
+        "the embedded LLM and its adapter": claims.judge_with_adapter(results),
     }
     return environment.get_template("results.md.j2").render(
         judged={llm: found for llm, found in judged.items() if any(f.verdict and f.model for f in found)},

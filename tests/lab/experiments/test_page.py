@@ -23,7 +23,7 @@ from lab.experiments.page import (
     swap,
     write_page,
 )
-from lab.experiments.result import Paired, Result
+from lab.experiments.result import Paired, Result, Sweep
 from lab.experiments.tables import cell
 from simulator.errors import UsageError
 from tests.support.made_results import CURVES, figure, interval, result, zero_from
@@ -100,6 +100,14 @@ def test_the_figure_that_it_shows_is_there_and_no_other(written: Path) -> None:
     assert all(path.read_text().endswith("</svg>\n") for path in linked)
 
 
+def test_a_sweep_of_one_scheme_gives_way_to_the_curves() -> None:
+    figures = [figure("curves", *CURVES, name="losses"), figure("sweep", "lost_packets", name="over_k")]
+    sweep = Sweep(label="k", at={"llm": 5.0, "k3": 3.0})
+    for flown, name in (({"llm"}, "losses"), ({"llm", "k3"}, "over_k")):
+        made = result("top-k", {s: {"lost_packets": 1.0} for s in flown}, figures=figures, sweep=sweep)
+        assert [one.name for one in shown(made)] == [name]
+
+
 def test_experiments_without_a_result_are_named(written: Path) -> None:
     listed = section(written.read_text(), "Not flown")
     assert set(re.findall(r"`([a-z-]+)`", listed)) == EXPERIMENTS.keys() - {"scheduler"}
@@ -143,7 +151,7 @@ def test_the_papers_statements_have_our_numbers_and_a_verdict_each(written: Path
 
 
 def test_the_statements_are_judged_again_for_the_llm_with_its_adapter(written: Path, tmp_path: Path) -> None:
-    heading = "with the LLM with its adapter (tiny.gguf)"
+    heading = "with the embedded LLM and its adapter (tiny.gguf)"
     assert heading not in written.read_text()
     adapted = result("adapter-claims", {"llm": {"lost_packets": 42.0}}, curves={"llm": zero_from(30)})
     text = page(stored(tmp_path, scheduler(), adapted))
