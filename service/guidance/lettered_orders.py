@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from service.guidance.note_numbers import LetteredNote, Number
 from service.guidance.note_orders import BadOrders
-from shared.planning.orders import End, Guidance
+from shared.planning.orders import End, Guidance, Impossible
 from shared.world.scenario import Scenario
 
 STATIC = "Orders of a note."
@@ -110,7 +110,11 @@ class _Orders:
             for sensor in range(self._scenario.sensors):
                 if not {f"visit:{sensor}", f"weight:{sensor}"} & self._values.keys():
                     self._values[f"weight:{sensor}"] = 0.0
-        return Guidance.of(self._values, {} if self._end is None else dict.fromkeys(self._values, self._end))
+        ends = {} if self._end is None else dict.fromkeys(self._values, self._end)
+        try:
+            return Guidance.of(self._values, ends)
+        except Impossible as error:
+            raise BadOrders(str(error)) from None
 
     def _visit(self, words: list[str]) -> None:
         if words[-1] == "always":

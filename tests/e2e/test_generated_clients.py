@@ -76,10 +76,11 @@ def test_a_generated_client_flies_a_step(
 ) -> None:
     with serving_edge(AICVDS_MODE="value", AICVDS_STORE="none") as (url, _):
         (tmp_path / "openapi.json").write_text(httpx.get(f"{url}/openapi.json", timeout=60).text)
-        made = subprocess.run([programs / command[0], *command[1:], "openapi.json"], cwd=tmp_path, capture_output=True)
+        generate = [str(programs / command[0]), *command[1:], "openapi.json"]
+        made = subprocess.run(generate, cwd=tmp_path, capture_output=True)
         assert made.returncode == 0, made.stderr
         (tmp_path / "fly.py").write_text(_BEGIN + code + _END)
-        arguments = [programs / "python", "fly.py", url, json.dumps(report())]
+        arguments = [str(programs / "python"), "fly.py", url, json.dumps(report())]
         flown = subprocess.run(arguments, cwd=tmp_path, capture_output=True, text=True)
     assert flown.returncode == 0, flown.stderr
     mode, sensor, result, fields, outcomes, missions = json.loads(flown.stdout)

@@ -87,7 +87,8 @@ def test_a_listener_gets_a_snapshot_and_then_what_changes(edge: Edge, report: Re
         assert told == [second]
         assert heard == [outcome]
         assert (update["step"], update["made"], update["settled"]) == (1, 2, 1)
-        assert update["uavs"]["0"] == {"step": 1, "position": [500.0, 450.0]}
+        flown = update["uavs"]["0"]
+        assert (flown["step"], flown["position"], flown["battery"]) == (1, [500.0, 450.0], None)
         client.delete("/missions/test")
         assert next(events) == ("gone", {})
         assert list(events) == []
