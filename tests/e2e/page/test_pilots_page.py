@@ -118,7 +118,8 @@ def test_decisions_of_one_uav_sensor_or_source(visit: Open, edge: str) -> None:
     expect(items).to_have_count(3)
     assert all("east, laps" in text for text in items.all_inner_texts())
     fly(edge, "filtered", 4)
-    expect(items).to_have_count(6)
+    # Each of the four steps is decided again, or for the first time.
+    expect(items).to_have_count(7)
     page.get_by_label("Sensor", exact=True).select_option(label="kp-0.10")
     expect(page.locator("#feed-none")).to_be_visible()
     page.get_by_label("Sensor", exact=True).select_option(label="all")
