@@ -41,7 +41,7 @@ EXPERIMENT = Experiment(
     worlds=("paper", "pipeline", "stress", "dense", "lossy_uplink"),
     notes=(
         "`LLM draws` answers a uniform draw of the letters offered: what mode guided brings whatever the LLM.",
-        "The modules' start, MADQN and MAPPO were trained on the scenario `paper` alone; elsewhere they are out of it. "
+        "MADQN and MAPPO were trained on the scenario `paper` alone; elsewhere they are out of it. "
         "A network made for other numbers of sensors and UAVs cannot fly there and is left out.",
         "In lossy_uplink a request that was lost three times is decided on board by the longest queue, and counts as "
         "the scheme's.",

@@ -1,7 +1,7 @@
 """The results page's tables: a result's first measures and its ratios on the same worlds, narrow enough for a page.
 
 A result of one scenario has one table, with a row a scheme. One of several scenarios has a column a scenario, in a
-table of its first measure and in one of the ratios to each reference. The data files have every measure.
+table of its first measure and in those of the ratios to the first reference and to each site's best heuristic. The data files have every measure.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lab.experiments.claims import CLAIM_SEEDS
+from lab.experiments.comparisons import BEST
 from lab.experiments.evidence import seeds_flown
 from lab.experiments.plots import BOUND_LABEL, label_of, measured
 from lab.experiments.result import Interval, Paired, Result
@@ -71,7 +72,8 @@ def _by_site(result: Result, measure: str, sites: Sequence[str]) -> list[Table]:
     texts = [[label, *(cell(found, digits) for found in cells)] for label, cells in rows.items()]
     tables = [Table(caption, ["scheme", *sites], texts)]
     at = {site: _ratios(result, f"{measure}@{site}") for site in sites}
-    for reference in _references(result, {key: pair for ratios in at.values() for key, pair in ratios.items()}):
+    references = _references(result, {key: pair for ratios in at.values() for key, pair in ratios.items()})
+    for reference in (r for r in references if r in (references[0], BEST)):
         texts = [
             [label_of(result, name), *(_ratio(at[site], name, reference) for site in sites)] for name in result.schemes
         ]
