@@ -50,6 +50,7 @@ class PhrasedNote:
     """
 
     def __init__(self, note: str, scenario: Scenario, in_force: Collection[str]) -> None:
+        self._note = note
         self.rest = self._lowered = note.lower()
         self._scenario = scenario
         self.withdrawn: list[str] = []
@@ -79,7 +80,9 @@ class PhrasedNote:
 
     @property
     def text(self) -> str:
-        """The rest as the LLM reads it."""
+        """The rest as the LLM reads it; the note as it is written if code has read nothing."""
+        if self.rest == self._lowered:
+            return self._note
         return re.sub(r"\s+(?=[.,;:!?]|$)|^(?:\W|and |then )+", "", " ".join(self.rest.split()))
 
     @property

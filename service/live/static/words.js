@@ -52,7 +52,7 @@ export const why = (answer) => (answer.reason ? (REASONS[answer.reason] ?? answe
 export const GUIDANCE = {
   none: "No note.",
   compiling: "The LLM is reading the note.",
-  proposed: "The LLM has read the note. Its orders wait for your confirmation:",
+  proposed: "The note was read. Its orders wait for your confirmation:",
   confirmed: "Confirmed.",
   rejected: "Rejected: the note is not obeyed.",
   failed: "The note was not understood, and is not obeyed:",

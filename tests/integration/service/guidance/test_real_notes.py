@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from typing import Any
 
 import httpx
@@ -12,11 +13,15 @@ import pytest
 
 from service.api.app import create_app
 from service.config.settings import Settings
-from tests.integration.service.llm.test_embedded import ready
+from tests.support.running import serving
+from tests.support.waiting import PATIENCE_S
 
 # A busy machine may need minutes for the three readings of a note.
 pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
-
+_LIMITS = (
+    *("guidance.note_compiler._ANSWER_S", "guidance.note_compiler._TIMEOUT_S", "llm.connection.PROBE_TIMEOUT_S"),
+    *("llm.probing._TOGETHER_TIMEOUT_S", "llm.calibration._TIMEOUT_S"),
+)
 LEAK = {"sensors": [{"sensor_id": 4, "visit_every": 3}]}
 LEAK_AND_LIMIT = {**LEAK, "max_velocity": 9}
 VISIT, LIMIT = "Visit sensor 4 at least once in every 3 steps.", "Never fly faster than 9 m/s."
@@ -24,10 +29,13 @@ VISIT, LIMIT = "Visit sensor 4 at least once in every 3 steps.", "Never fly fast
 
 @pytest.fixture(scope="module")
 def client() -> Iterator[httpx.Client]:
-    with pytest.MonkeyPatch.context() as patient, ready(create_app(Settings(mode="llm", deadline_ms=60_000))) as client:
-        for limit in ("_ANSWER_S", "_TIMEOUT_S"):
-            patient.setattr(f"service.guidance.note_compiler.{limit}", 900.0)
-        yield client
+    with ExitStack() as stack:
+        patient = stack.enter_context(pytest.MonkeyPatch.context())
+        for limit in _LIMITS:
+            patient.setattr(f"service.{limit}", 900.0)
+        url = stack.enter_context(serving(create_app(Settings(mode="llm", deadline_ms=60_000))))
+        # A note waits for the LLM to load.
+        yield stack.enter_context(httpx.Client(base_url=url, timeout=PATIENCE_S))
 
 
 def read(client: httpx.Client, note: str, before: dict[str, Any] | None) -> dict[str, Any]:

@@ -70,7 +70,7 @@ async def test_an_unlikely_reading_has_a_doubt() -> None:
 async def test_a_part_that_the_llm_finds_unclear_is_quoted() -> None:
     unclear = f"{RIGHT}; unclear"
     assert (await reading(Adapted([unclear] * 3))).doubts == (
-        "A part of the note is unclear, and is in no order: “sensor 4 every 3 steps, and nobody exceeds 9 m/s.”.",
+        f"A part of the note is unclear, and is in no order: “{NOTE}”.",
     )
     # Where code finds the words that are in no order, it quotes just these.
     more = PhrasedNote(f"{NOTE[:-1]}, and be careful.", PAPER, ())
