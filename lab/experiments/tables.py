@@ -1,8 +1,8 @@
 """The results page's tables: a result's first measures and its ratios on the same worlds, narrow enough for a page.
 
 A result of one scenario has one table, with a row a scheme. One of several scenarios has a column a scenario: in a
-table of its first measure, and in those of the ratios to the first reference and to each scenario's best heuristic. The data
-files have every measure.
+table of its first measure, and in those of the ratios to the first reference and to each scenario's best heuristic.
+The data files have every measure.
 """
 
 from __future__ import annotations
