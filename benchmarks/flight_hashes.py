@@ -33,8 +33,8 @@ import tyro
 from benchmarks.harness import edge
 from shared.client.edge_client import EdgeClient
 from simulator.commands.options import site_from_options
+from simulator.flying.edge_session import LossyTransport
 from simulator.flying.flight import fly
-from simulator.flying.lossy_transport import LossyTransport
 from simulator.flying.pilots import EdgePilot, LocalPilot
 
 # The only internal names: the functions that fly a world, and the radio that loses requests.

@@ -26,9 +26,9 @@ FROM dependencies AS model
 COPY shared/ shared/
 COPY service/__init__.py service/
 COPY service/commands/__init__.py service/commands/fetch_model.py service/commands/
-COPY service/llm/__init__.py service/llm/model_file.py service/llm/requantize.py service/llm/
+COPY service/llm/__init__.py service/llm/model_file.py service/llm/
 COPY service/prompting/__init__.py service/prompting/tokenizer.py service/prompting/
-COPY service/config/__init__.py service/config/settings.py service/config/prompt_budget.py service/config/
+COPY service/config/__init__.py service/config/settings.py service/config/
 RUN PYTHONPATH=/src AICVDS_CACHE_DIR=/opt/model aicvds model fetch
 
 FROM dependencies AS application

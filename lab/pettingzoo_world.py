@@ -15,8 +15,7 @@ from shared.world.scenario import SCENARIOS, Scenario
 from shared.world.trajectory import Trajectory, trajectories
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import Cost, Observation
-from simulator.world.true_channel import LOSS_BOUNDS_DB, mean_only
-from simulator.world.truth import LARGEST_ERROR
+from simulator.world.truth import LARGEST_ERROR, LOSS_BOUNDS_DB, mean_only
 
 
 class PettingZooWorld(PipelineWorld, ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: ignore[misc]

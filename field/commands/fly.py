@@ -147,7 +147,7 @@ def job_from_options(options: Fly) -> FieldJob:
     require_mavsdk()
     site = checked_site(options)
     from field.vehicles.field_run import FieldJob
-    from field.vehicles.simulated_radio import SIMULATED, radio_named
+    from field.vehicles.radio import SIMULATED, radio_named
 
     step_s = site.scenario.step_s / options.speedup
     patience_s = min(MOST_PATIENCE_S, step_s / 2) if options.patience_s is None else options.patience_s
@@ -221,7 +221,7 @@ def checked_site(options: Fly) -> Site:
 
 def conclude(flown: RealFlight, job: FieldJob, command: str, console: Console) -> None:
     """Write a flight's summary and report, and print its outcome; raises ``UsageError``: the folder is unusable."""
-    from field.vehicles.simulated_radio import SimulatedRadio
+    from field.vehicles.radio import SimulatedRadio
     from simulator.records.real_uavs import RealUavs, sums_by_uav
     from simulator.records.summary import summarise
     from simulator.reporting.results import write_results

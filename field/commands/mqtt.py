@@ -80,8 +80,7 @@ def _forward(configuration: Configuration, options: Mqtt) -> int:
     from prometheus_client import start_http_server
 
     from field.lorawan.edge_sender import EdgeSender
-    from field.lorawan.mqtt_metrics import MqttMetrics
-    from field.lorawan.pending_readings import ReadingBuffer
+    from field.lorawan.pending_readings import MqttMetrics, ReadingBuffer
     from field.lorawan.subscription import Subscription
 
     metrics = MqttMetrics()

@@ -7,8 +7,7 @@ from datetime import UTC, datetime
 
 import httpx
 
-from field.lorawan.mqtt_metrics import MqttMetrics
-from field.lorawan.pending_readings import PendingReading, ReadingBuffer
+from field.lorawan.pending_readings import MqttMetrics, PendingReading, ReadingBuffer
 from shared.client.edge_client import EdgeClient
 from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused
 from shared.wire.readings import MAX_AGE_S, ReadingResult, ReadingsRequest, SensorReading

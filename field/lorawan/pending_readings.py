@@ -10,16 +10,18 @@ from datetime import UTC, datetime, timedelta
 from itertools import islice
 from typing import Any, Literal
 
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from pydantic import ValidationError
 from pydantic_core import from_json
 
 from field.lorawan.configuration import Configuration, Device
-from field.lorawan.mqtt_metrics import MqttMetrics
 from field.lorawan.uplinks import DECODERS, DeviceMessage
 from shared.kit.validation_messages import problem_of
 
+_AGE_BUCKETS_S = (0.5, 1, 2, 5, 10, 30, 60, 120, 300, 600, 1800, 3600)
+_RSSI_BUCKETS_DBM = (-140, -130, -125, -120, -115, -110, -105, -100, -90, -80, -60)
+_SNR_BUCKETS_DB = (-20, -17.5, -15, -12.5, -10, -7.5, -5, -2.5, 0, 2.5, 5, 10)
 log = logging.getLogger(__name__)
-
 # The largest LoRaWAN payload has 242 bytes; the metadata of many gateways is some kilobytes.
 _MAX_BYTES = 65_536
 # The most that the clocks of network server and edge may differ.
@@ -31,11 +33,42 @@ _MOST_WARNINGS = 10_000
 # Field names in a warning, and characters of each.
 _NAMES_SHOWN, _NAME_LENGTH = 20, 60
 _EPOCH = datetime.min.replace(tzinfo=UTC)
-
 MessageResult = Literal[
     "accepted", "battery", "duplicate", "foreign", "future", "no_queue", "outdated", "simulated", "too_large",
     "too_old", "unknown_device", "unreadable",
 ]  # fmt: skip
+
+
+class MqttMetrics:
+    """The metrics of one process, in their own registry."""
+
+    def __init__(self) -> None:
+        self.registry = r = CollectorRegistry()
+        self.uplinks = Counter(
+            "aicvds_mqtt_uplinks", "Messages of the broker by what became of them", ["result"], registry=r
+        )
+        self.readings = Counter(
+            "aicvds_mqtt_readings", "Readings sent to the edge by its answer", ["result"], registry=r
+        )
+        self.failures = Counter("aicvds_mqtt_edge_failures", "Requests that the edge did not answer well", registry=r)
+        self.connects = Counter("aicvds_mqtt_connects", "Connections to the broker by result", ["result"], registry=r)
+        self.connected = Gauge("aicvds_mqtt_connected", "Whether the broker is subscribed to, 1 or 0", registry=r)
+        self.waiting = Gauge("aicvds_mqtt_waiting", "Readings that wait for the edge, at most one a device", registry=r)
+        self.age_s = Histogram(
+            "aicvds_mqtt_age_seconds", "Age of a reading as it is sent to the edge", registry=r, buckets=_AGE_BUCKETS_S
+        )
+        self.rssi_dbm = Histogram(
+            "aicvds_mqtt_rssi_dbm",
+            "Signal strength at the gateway that heard an uplink best",
+            registry=r,
+            buckets=_RSSI_BUCKETS_DBM,
+        )
+        self.snr_db = Histogram(
+            "aicvds_mqtt_snr_db",
+            "Signal-to-noise ratio at the gateway that heard an uplink best",
+            registry=r,
+            buckets=_SNR_BUCKETS_DB,
+        )
 
 
 @dataclass(frozen=True, slots=True)

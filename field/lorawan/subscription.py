@@ -9,8 +9,7 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
 from field.lorawan.configuration import Configuration
-from field.lorawan.mqtt_metrics import MqttMetrics
-from field.lorawan.pending_readings import ReadingBuffer
+from field.lorawan.pending_readings import MqttMetrics, ReadingBuffer
 
 log = logging.getLogger(__name__)
 

@@ -10,21 +10,50 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
 from field.errors import VehicleError
 from field.vehicles.field_pilot import FieldPilot
 from field.vehicles.field_uav import LINK_LOST, NO_POSITION, FieldUav
-from field.vehicles.heard_beacons import LossCounters
-from field.vehicles.mission_clock import Clock, MissionClock
-from field.vehicles.radio import Collected, Radio, Spot
+from field.vehicles.radio import Collected, LossCounters, Radio, Spot
 from shared.wire.schemas import Mode
 from simulator.flying.pilots import PilotChoice
 from simulator.records.decision import Decision
 from simulator.records.flight import Flight, exchange_fields
 from simulator.sites.site import Site
 from simulator.world.observation import StepTally
+
+# Parts of a step in which the speed is corrected; in the last one a new speed would take effect too late.
+_PARTS = 5
+
+
+class Clock(Protocol):
+    """Seconds of the mission since some instant."""
+
+    def now(self) -> float:
+        """The present time, seconds."""
+        ...
+
+    async def until(self, time_s: float) -> None:
+        """Wait until then; not at all if it is over."""
+        ...
+
+
+class MissionClock:
+    """The machine's clock, ``speedup`` times as fast."""
+
+    def __init__(self, speedup: float = 1.0) -> None:
+        self._speedup = speedup
+
+    def now(self) -> float:
+        """The present time, seconds."""
+        return time.monotonic() * self._speedup
+
+    async def until(self, time_s: float) -> None:
+        """Wait until then."""
+        await asyncio.sleep(max(0.0, time_s - self.now()) / self._speedup)
 
 
 @dataclass
@@ -58,10 +87,6 @@ class _Leg:
     choice: PilotChoice
     spot: Spot
     start_m: float
-
-
-# Parts of a step in which the speed is corrected; in the last one a new speed would take effect too late.
-_PARTS = 5
 
 
 class FieldFlight:

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from field.errors import VehicleError
-from field.vehicles.field_flight import FieldFlight, RealFlight
+from field.vehicles.field_flight import FieldFlight, MissionClock, RealFlight
 from field.vehicles.field_pilot import FieldPilot
 from field.vehicles.field_uav import FieldUav
 from field.vehicles.mavlink_vehicle import mavlink_vehicle
-from field.vehicles.mission_clock import MissionClock
 from field.vehicles.radio import Radio
 from shared.client.edge_client import API_KEY, AsyncEdgeClient
 from shared.client.errors import EdgeError

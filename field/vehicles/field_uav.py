@@ -6,9 +6,8 @@ import time
 import numpy as np
 
 from field.errors import VehicleError
-from field.vehicles.heard_beacons import HeardBeacons
-from field.vehicles.radio import Spot
-from field.vehicles.vehicle import FlightMode, Vehicle, VehicleState
+from field.vehicles.mavlink_vehicle import FlightMode, Vehicle, VehicleState
+from field.vehicles.radio import HeardBeacons, Spot
 from shared.world.scenario import Point
 from shared.world.trajectory import Trajectory, trajectories
 from simulator.sites.site import Site

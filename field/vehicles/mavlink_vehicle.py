@@ -13,13 +13,16 @@ import math
 import time
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
 
 from field.errors import VehicleError
-from field.vehicles.vehicle import FlightMode, VehicleState
+from shared.world.scenario import Point
 from simulator.errors import UsageError
 from simulator.sites.plans.mission_path import MissionItem
 
+# `mission`: it flies its uploaded mission; `hold`: it hovers or circles in place; `returning`: to where it took off.
+FlightMode = Literal["mission", "hold", "landing", "returning", "other"]
 # MAVSDK notices a lost heartbeat after this time, too.
 STALE_S = 3.0
 # ArduPilot sends no position unasked: its stream rates are 0 until a ground station sets them (GCS_MAVLink_Parameters;
@@ -32,6 +35,65 @@ _PAUSE_CONTINUE, _UNSUPPORTED = 193, 3
 _RELATIVE_FRAMES = {3, 6}
 # The scale of a mission item's latitude and longitude.
 _DEGREES = 1e-7
+
+
+@dataclass(frozen=True)
+class VehicleState:
+    """The newest telemetry of a vehicle.
+
+    Attributes:
+        connected: whether heartbeats arrive.
+        armed: as the autopilot says; ``None`` before its first heartbeat.
+        mode: the autopilot's flight mode.
+        position: longitude and latitude, degrees; ``None`` without a fix, and while none arrives.
+        height_m: above the autopilot's home, which may be another place than that of its take-off.
+        in_air: the autopilot's landed state; ``None`` where it says none.
+        speed_m_s: over the ground; ``None`` where the autopilot says none.
+        battery_percent: that is left; ``None`` where the autopilot says none.
+    """
+
+    connected: bool
+    armed: bool | None
+    mode: FlightMode
+    position: Point | None
+    height_m: float = 0.0
+    in_air: bool | None = None
+    speed_m_s: float | None = None
+    battery_percent: float | None = None
+
+
+class Vehicle(Protocol):
+    """A vehicle with an autopilot that has a mission. The commands are a speed, wait, and go on.
+
+    Every method may raise :class:`field.errors.VehicleError`.
+
+    Attributes:
+        name: for messages.
+        waits_in_mission: whether the mode stays ``mission`` while it waits.
+    """
+
+    name: str
+    waits_in_mission: bool
+
+    async def state(self) -> VehicleState:
+        """The newest telemetry; never waits for the vehicle."""
+        ...
+
+    async def mission(self) -> list[MissionItem]:
+        """The mission on board."""
+        ...
+
+    async def set_speed(self, speed_m_s: float) -> None:
+        """Fly along the mission at this ground speed, above 0."""
+        ...
+
+    async def hold(self) -> None:
+        """Wait in place, in the mission."""
+        ...
+
+    async def resume(self) -> None:
+        """Go on with the mission."""
+        ...
 
 
 def require_mavsdk() -> None:
@@ -107,7 +169,7 @@ async def _connected(url: str, wait_s: float, system_id: int) -> AsyncIterator[A
 
 
 class MavlinkVehicle:
-    """One vehicle; see :class:`field.vehicles.vehicle.Vehicle`.
+    """One vehicle; see :class:`field.vehicles.mavlink_vehicle.Vehicle`.
 
     Args:
         name: for messages: its connection.

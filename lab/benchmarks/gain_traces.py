@@ -36,12 +36,10 @@ from shared.world.actions import Action
 from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario, scenario_named
 from shared.world.trajectory import trajectories
-from simulator.flying.flight import fly
+from simulator.flying.flight import fly, rollout
 from simulator.flying.pilots import EdgePilot
-from simulator.flying.rollout import rollout
 from simulator.policies.mpc import RecedingHorizonPolicy
-from simulator.policies.policy import Policy
-from simulator.policies.registry import policy_named
+from simulator.policies.registry import Policy, policy_named
 from simulator.sites.site import Site
 from simulator.world.gain_trace import GainTrace
 from simulator.world.observation import Observation

@@ -32,9 +32,9 @@ from shared.belief.radio_map import RadioMap
 from shared.belief.shadowing import Shadowing
 from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario, scenario_named
-from simulator.flying.rollout import rollout
+from simulator.flying.flight import rollout
 from simulator.policies.mpc import RecedingHorizonPolicy
-from simulator.policies.policy import Policy
+from simulator.policies.registry import Policy
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld
 

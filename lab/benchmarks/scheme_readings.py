@@ -23,10 +23,9 @@ import tyro
 from lab.experiments.intervals import interval
 from shared.world.channel import FloatArray, best_gain_db, whole_rate_bps
 from shared.world.scenario import SCENARIOS
-from simulator.flying.rollout import rollout
-from simulator.policies.paper_schemes import EarliestOverflowFirst, WeightedQueueChannel
-from simulator.policies.policy import Policy
-from simulator.policies.reach import free_sensors
+from simulator.flying.flight import rollout
+from simulator.policies.hand_written import EarliestOverflowFirst, WeightedQueueChannel, free_sensors
+from simulator.policies.registry import Policy
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import Observation
 

@@ -19,8 +19,8 @@ from lab.experiments.stand_ins import answering, drawn, worst
 from shared.client.edge_client import API_KEY, EdgeClient
 from shared.client.errors import EdgeError
 from shared.world.scenario import Scenario
+from simulator.flying.edge_session import LossyTransport
 from simulator.flying.local_edge import HOST, check_alive, edge_process, usable_port
-from simulator.flying.lossy_transport import LossyTransport
 
 # Settings for the machine's capacity and paths. Every other setting may change decisions, and a figure must not depend
 # on the user's environment.

@@ -8,7 +8,7 @@ import numpy as np
 
 from lab.exploration.wind import course
 from shared.planning.receding import Draft
-from simulator.bound.true_problem import true_links
+from simulator.bound.clairvoyant_bound import true_links
 from simulator.flying.pilots import LocalPilot, PilotChoice
 from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.sites.site import Site

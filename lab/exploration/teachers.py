@@ -7,7 +7,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.bound.true_problem import true_problem
+from simulator.bound.clairvoyant_bound import true_problem
 from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import Observation

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from shared.planning.fleet_problem import FleetProblem
 from shared.world.channel import FloatArray, IntArray
-from simulator.bound.clairvoyant_bound import replay
+from simulator.bound.clairvoyant_bound import problem_with, replay, true_links, true_problem
 from simulator.bound.solver import Budget, Plan, least_loss, plan
-from simulator.bound.true_problem import problem_with, true_links, true_problem
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld
 

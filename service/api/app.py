@@ -11,8 +11,7 @@ from fastapi import FastAPI
 
 from service.api import live_routes, problem_details
 from service.api.api_keys import ApiKeys
-from service.api.authentication import KeyAuthentication
-from service.api.host_names import KnownHosts
+from service.api.authentication import KeyAuthentication, KnownHosts
 from service.api.load_limits import RequestLimits
 from service.api.openapi import schema_of
 from service.api.routes import decisions, router

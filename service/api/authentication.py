@@ -1,9 +1,12 @@
-"""Authentication by API key, with scopes and a rate limit for each key."""
+"""Authentication by API key, with scopes and a rate limit for each key; without keys, a check of the name asked."""
 
 import math
 import re
+import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
+from ipaddress import ip_address
+from urllib.parse import urlsplit
 
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
@@ -11,6 +14,7 @@ from starlette.types import Scope as AsgiScope
 from service.api.api_keys import MOST_KEYS, ApiKey, ApiKeys, Scope
 from service.api.load_limits import READING
 from service.api.problem_details import problem_response, refusal_of
+from service.config.settings import Settings
 from service.errors import NotFound
 from shared.kit.bounded import BoundedDict
 
@@ -27,6 +31,7 @@ _MINUTE_S = 60.0
 KEY = "aicvds.key"
 # The ASGI scope's entry for streams: a function that returns whether the key is still known, and for this mission.
 STILL_KNOWN = "aicvds.still_known"
+_PORT = re.compile(r":\d*$")
 
 
 def scope_of(method: str, path: str) -> Scope | None:
@@ -111,3 +116,40 @@ def _presented(headers: Sequence[tuple[bytes, bytes]]) -> str:
         return ""
     scheme, _, token = given[0].decode("latin-1").partition(" ")
     return token.strip() if scheme.lower() == "bearer" else ""
+
+
+class KnownHosts:
+    """Pure ASGI middleware: 403 for a request to a name that is neither this machine's nor listed in the settings.
+
+    An edge with keys answers to every name. With ``AICVDS_ANONYMOUS=on`` all addresses and this machine's name are
+    known. A request without Host comes from no browser.
+    """
+
+    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+        self.app = app
+        names = {name.strip().lower() for name in settings.hosts.split(",")}
+        self._checks = settings.keys is None and "*" not in names
+        self._any_address = settings.anonymous == "on"
+        own = {"localhost", urlsplit(settings.advertise_url or "").hostname or "localhost"}
+        self._names = names - {""} | own | ({socket.gethostname().lower()} if self._any_address else set())
+
+    def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> Awaitable[None]:
+        if self._checks and scope["type"] == "http":
+            hosts = [value for name, value in scope["headers"] if name == b"host"]
+            if len(hosts) > 1 or not all(map(self._known, hosts)):
+                refusal = problem_response(
+                    403, "without API keys the edge answers to this machine's names and those in AICVDS_HOSTS only"
+                )
+                refusal.headers["Connection"] = "close"
+                return refusal(scope, receive, send)
+        return self.app(scope, receive, send)
+
+    def _known(self, host: bytes) -> bool:
+        name = _PORT.sub("", host.decode("latin-1")).lower().strip("[]").rstrip(".")
+        if name in self._names:
+            return True
+        try:
+            address = ip_address(name)
+        except ValueError:
+            return False
+        return self._any_address or address.is_loopback

@@ -12,14 +12,13 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import ValidationError
 
-from service.api import attention_weights
 from service.api.api_keys import ApiKey, ApiKeys
 from service.api.authentication import KEY, no_mission
+from service.api.mission_answers import attention_response, status_of
 from service.api.problem_details import documented
 from service.edge.engine import Engine
 from service.live.alarms import KINDS
 from service.llm.server_pool import ServerPool
-from service.mission.mission_status import status_of
 from service.observability.metrics import Metrics
 from shared.planning.guidance_messages import GuidanceAnswer, GuidanceStatus
 from shared.wire.missions import MissionAttention, MissionStatus
@@ -36,6 +35,9 @@ from shared.wire.schemas import (
     Readiness,
 )
 
+# The statuses of refusals: of a request that names a mission, and of one that also has a body.
+_NAMED = (404, 409, 421, 422, 503)
+_SENT = (400, 404, 408, 409, 413, 415, 421, 422, 503)
 _KEY, _KEY_PATTERN = "Idempotency-Key", re.compile(r"[\x21-\x7e]{1,64}")
 
 
@@ -114,12 +116,7 @@ RequestKey = Annotated[
 KnownTags = Annotated[str | None, Header(alias="If-None-Match", max_length=1000, description="ETags of what is held")]
 
 
-@decisions.post(
-    "/decide",
-    response_model=DecideResponse,
-    responses=documented(400, 404, 408, 409, 413, 415, 421, 422, 503),
-    tags=["decisions"],
-)
+@decisions.post("/decide", response_model=DecideResponse, responses=documented(*_SENT), tags=["decisions"])
 async def decide(body: DecideRequest, request: Request, key: RequestKey = None) -> Response:
     """The sensor to collect from, and the velocity of the next step."""
     _refuse_unless_bound(request, body.mission_id)
@@ -130,7 +127,7 @@ async def decide(body: DecideRequest, request: Request, key: RequestKey = None) 
     return Response(answer.model_dump_json(), media_type="application/json", headers=timing)
 
 
-@router.post("/decide/batch", responses=documented(400, 404, 408, 409, 413, 415, 421, 422, 503), tags=["decisions"])
+@router.post("/decide/batch", responses=documented(*_SENT), tags=["decisions"])
 async def decide_batch(
     body: BatchRequest, request: Request, engine: TheEngine, key: RequestKey = None
 ) -> BatchResponse:
@@ -139,7 +136,7 @@ async def decide_batch(
     return BatchResponse(decisions=await engine.decide_batch(body, may_make=may_command(request), key=key))
 
 
-@router.post("/feedback", responses=documented(400, 404, 408, 409, 413, 415, 421, 422, 503), tags=["decisions"])
+@router.post("/feedback", responses=documented(*_SENT), tags=["decisions"])
 async def feedback(body: FeedbackRequest, request: Request, engine: TheEngine) -> FeedbackResponse:
     """A decision's outcome. A repeated outcome is applied once; an acknowledged outcome is on disk."""
     if body.mission_id is not None:
@@ -156,15 +153,13 @@ async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngin
     return status_of(mission)
 
 
-@router.get("/missions/{mission_id}", responses=documented(404, 409, 421, 422, 503), tags=["missions"])
+@router.get("/missions/{mission_id}", responses=documented(*_NAMED), tags=["missions"])
 async def get_mission(mission_id: MissionId, engine: TheEngine) -> MissionStatus:
     """A mission's setup and progress."""
     return status_of(await engine.missions.get(mission_id))
 
 
-@router.delete(
-    "/missions/{mission_id}", status_code=204, responses=documented(404, 409, 421, 422, 503), tags=["missions"]
-)
+@router.delete("/missions/{mission_id}", status_code=204, responses=documented(*_NAMED), tags=["missions"])
 async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
     """Delete a mission and everything it learned."""
     await engine.delete(mission_id)
@@ -173,7 +168,7 @@ async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
 @router.get(
     "/missions/{mission_id}/attention",
     response_model=MissionAttention,
-    responses={304: {"description": "the same as `If-None-Match` names"}, **documented(404, 409, 421, 422, 503)},
+    responses={304: {"description": "the same as `If-None-Match` names"}, **documented(*_NAMED)},
     tags=["missions"],
 )
 async def get_attention(
@@ -181,20 +176,16 @@ async def get_attention(
 ) -> Response:
     """The attention module's weights, with an ETag: to score the sensors on board, and report only the k best."""
     mission = await engine.missions.get(mission_id)
-    return attention_weights.attention_response(mission, known_tags, request.headers.get("Accept-Encoding", ""))
+    return attention_response(mission, known_tags, request.headers.get("Accept-Encoding", ""))
 
 
-@router.get("/missions/{mission_id}/guidance", responses=documented(404, 409, 421, 422, 503), tags=["missions"])
+@router.get("/missions/{mission_id}/guidance", responses=documented(*_NAMED), tags=["missions"])
 async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStatus:
     """The operator's note, the guidance from it, and its status; only confirmed guidance is obeyed."""
     return (await engine.missions.get(mission_id)).guidance.report(mission_id)
 
 
-@router.post(
-    "/missions/{mission_id}/guidance",
-    responses=documented(400, 404, 408, 409, 413, 415, 421, 422, 503),
-    tags=["missions"],
-)
+@router.post("/missions/{mission_id}/guidance", responses=documented(*_SENT), tags=["missions"])
 async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: TheEngine) -> GuidanceStatus:
     """Confirm or reject the proposed guidance, give a structure or a new note, or withdraw orders in force.
 
@@ -209,11 +200,7 @@ async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: The
     return mission.guidance.report(mission_id)
 
 
-@router.post(
-    "/missions/{mission_id}/readings",
-    responses=documented(400, 404, 408, 409, 413, 415, 421, 422, 503),
-    tags=["missions"],
-)
+@router.post("/missions/{mission_id}/readings", responses=documented(*_SENT), tags=["missions"])
 async def post_readings(mission_id: MissionId, body: ReadingsRequest, engine: TheEngine) -> ReadingsResponse:
     """Sensors' own readings over another network, merged into the fleet's belief by their age."""
     return await engine.read(mission_id, body)

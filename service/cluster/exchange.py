@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import chain, zip_longest
 from typing import Any
 
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope
 
-from service.cluster.merging import Answer
+from shared.wire.missions import MissionLine, MissionList
+from shared.wire.schemas import Readiness
 
+# The header with the time of an edge's newest decision.
+DECIDED_AT = "x-decided-at"
+_MOST_LISTED = 200
 # Routes whose body names the mission, `default` unless it says otherwise.
 _BY_BODY = frozenset(("/decide", "/decide/batch", "/feedback"))
 _DEFAULT = "default"
@@ -19,6 +26,87 @@ _EVENTS = re.compile(r"/missions/[^/]+/events")
 _LONGEST_MS = 60_000
 # The entries of an ASGI scope that an application reads, apart from its own.
 _SENT = ("type", "http_version", "method", "scheme", "path", "raw_path", "query_string", "root_path", "headers")
+
+
+@dataclass
+class Answer:
+    """A buffered answer."""
+
+    status: int = 0
+    headers: list[tuple[bytes, bytes]] = field(default_factory=list)
+    body: bytes = b""
+
+    async def send(self, message: Message) -> None:
+        """Take a message of the application."""
+        if message["type"] == "http.response.start":
+            self.status, self.headers = message["status"], list(message.get("headers", ()))
+        else:
+            self.body += message.get("body", b"")
+
+    def header(self, name: str) -> str | None:
+        """The value of a header in lower case."""
+        return next((value.decode("latin-1") for key, value in self.headers if key.lower() == name.encode()), None)
+
+
+def merged_metrics(answers: Mapping[str, Answer]) -> Response:
+    """All samples of answers with status 200, at least one, each with the name of its edge as a label."""
+    texts = {name: answer.body.decode() for name, answer in answers.items()}
+    return Response(gathered(texts), media_type=next(iter(answers.values())).header("content-type"))
+
+
+def merged_readiness(answers: Iterable[Answer]) -> Response:
+    """Ready if all edges are; the LLM is ready if all have reached it."""
+    found = [Readiness.model_validate_json(a.body) for a in answers if a.status in (200, 503)]
+    shown = min(found, key=lambda one: (one.ready, one.llm == "ready"))
+    return Response(shown.model_dump_json(), 200 if shown.ready else 503, media_type="application/json")
+
+
+def merged_missions(answers: Iterable[Answer]) -> Response:
+    """All edges' missions, interleaved, from the edge that decided last on; each edge's stay in their order.
+
+    A mission that is only in the store may be in several lists. All answers have status 200; there is at least one.
+    """
+    listed = sorted(answers, key=lambda answer: -float(answer.header(DECIDED_AT) or 0.0))
+    lists = [MissionList.model_validate_json(answer.body) for answer in listed]
+    lines = dict[str, MissionLine]()
+    for line in chain.from_iterable(zip_longest(*(one.missions for one in lists))):
+        if line is not None and (line.mission_id not in lines or line.mode is not None):
+            lines[line.mission_id] = line
+    more = sum(one.more for one in lists) + max(0, len(lines) - _MOST_LISTED)
+    newest = next((one.newest for one in lists if one.newest is not None), None)
+    may_command = lists[0].may_command
+    shown = list(lines.values())[:_MOST_LISTED]
+    merged = MissionList(missions=shown, more=more, newest=newest, may_command=may_command)
+    return Response(merged.model_dump_json(), media_type="application/json")
+
+
+def gathered(texts: Mapping[str, str]) -> str:
+    """Merge several processes' expositions in Prometheus's text format.
+
+    The samples of a metric follow each other after one HELP and one TYPE, as the format demands. An absent process has
+    no samples: the sum of rates over the others stays right, and its counters restart with it.
+    """
+    heads, samples = dict[str, list[str]](), dict[str, list[str]]()
+    for process, text in texts.items():
+        name = ""
+        for line in text.splitlines():
+            if line.startswith("# HELP "):
+                name = line.split(" ", 3)[2]
+                heads.setdefault(name, [])
+            if not line.startswith("#"):
+                samples.setdefault(name, []).append(_labelled(line, process))
+            elif line not in heads.setdefault(name, []) and len(heads[name]) < 2:
+                heads[name].append(line)
+    return "".join(f"{line}\n" for name in heads for line in (*heads[name], *samples.get(name, ())))
+
+
+def _labelled(sample: str, process: str) -> str:
+    """A sample with the label ``process``; no metric's name has a brace or a space."""
+    name, brace, rest = sample.partition("{")
+    if brace and " " not in name:
+        return f'{name}{{process="{process}",{rest}'
+    name, _, value = sample.partition(" ")
+    return f'{name}{{process="{process}"}} {value}'
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,11 +14,10 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.types import Receive, Scope, Send
 
-from service.api.host_names import KnownHosts
+from service.api.authentication import KnownHosts
 from service.api.load_limits import RequestLimits
 from service.api.problem_details import problem_response
-from service.cluster.exchange import Exchanged
-from service.cluster.merging import Answer, merged_metrics, merged_missions, merged_readiness
+from service.cluster.exchange import Answer, Exchanged, merged_metrics, merged_missions, merged_readiness
 from service.config.settings import Settings
 from service.server.middleware import SecurityHeaders
 from shared.kit.bounded import BoundedDict

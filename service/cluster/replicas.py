@@ -1,11 +1,15 @@
-"""The owners of missions as replicas of a Ray Serve deployment."""
+"""The owners of missions, ordinary edges with their own addresses, as replicas of a Ray Serve deployment."""
+
+from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 from collections.abc import Awaitable, Callable
+from functools import partial
 from hashlib import blake2b
 from importlib.metadata import version
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ray import serve
 from ray.exceptions import RayError
@@ -13,12 +17,15 @@ from ray.serve.config import AutoscalingConfig, RequestRouterConfig
 from ray.serve.exceptions import RayServeException
 from ray.serve.schema import LoggingConfig
 
-from service.cluster.exchange import Exchanged
+from service.cluster.exchange import DECIDED_AT, Answer, Exchanged, answer_of
 from service.cluster.ingress import OwnersGone
-from service.cluster.merging import Answer
-from service.cluster.owner import Owner
 from service.config.settings import Settings
+from service.observability import logs
+from service.server.server import Server
 from shared.kit.ray_connection import RayUnusable
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
 
 _NAME = "aicvds-"
 _ROUTER = "ray.serve.experimental.consistent_hash_router.ConsistentHashRouter"
@@ -28,8 +35,68 @@ _ONGOING = 8
 _HEALTH_PERIOD_S, _HEALTH_TIMEOUT_S = 1.0, 10.0
 # The edge's own end takes up to 9 s.
 _SHUTDOWN_S = 15.0
-
 Answered = TypeVar("Answered")
+
+
+class Owner:
+    """One edge, whose requests come from the ingress; requests for missions that moved here come to its own address.
+
+    Args:
+        host: the address at which it listens; None for its machine's address in the cluster.
+    """
+
+    def __init__(self, settings: Settings, host: str | None) -> None:
+        import ray
+
+        logs.configure(settings.log_level, settings.log_format)
+        own_host: str = host or ray.util.get_node_ip_address()  # type: ignore[no-untyped-call]
+        self._listener = socket.create_server((own_host, 0))
+        self._url = f"http://{own_host}:{self._listener.getsockname()[1]}"
+        own = settings.model_copy(update={"advertise_url": self._url})
+        self._server = Server(partial(_application, own), settings.log_level)
+        self._serving: asyncio.Task[None] | None = None
+
+    async def answer(self, request: Exchanged) -> Answer:
+        """The edge's answer to a request."""
+        return await answer_of(self._server.gate, request)
+
+    async def named_answer(self, request: Exchanged) -> tuple[str, Answer]:
+        """The edge's address and its answer, with the time of its newest decision."""
+        answer = await self.answer(request)
+        app = self._server.gate.app
+        decided_at: float = 0.0 if app is None else app.state.engine.live.history.decided_at
+        answer.headers.append((DECIDED_AT.encode(), repr(decided_at).encode()))
+        return self._url.removeprefix("http://"), answer
+
+    async def address(self) -> str:
+        """The edge's URL."""
+        return self._url
+
+    async def check_health(self) -> None:
+        """Raises where the edge has ended; Ray Serve then replaces it.
+
+        The first check starts the edge and waits until it is loaded, and so do the requests, until it has passed.
+        """
+        if self._serving is None:
+            # The event loop does not run yet when the object is made.
+            self._serving = asyncio.create_task(self._server.serve(sockets=[self._listener]), name="edge")
+        await self._server.gate.opened()
+        if self._server.error is not None or self._serving.done():
+            raise RuntimeError(f"the edge has ended: {self._server.error}")
+
+    async def __del__(self) -> None:
+        # Ray Serve awaits this method, and has no other way to end an edge.
+        if self._serving is not None:
+            self._server.should_exit = True
+            await self._serving
+
+
+def _application(settings: Settings) -> FastAPI:
+    # The ingress imports this module too, and needs no torch.
+    from service.api.app import create_app
+    from service.storage.store import Store
+
+    return create_app(settings, Store(settings.store))
 
 
 class ServeOwners:

@@ -145,8 +145,7 @@ def checked_settings(given: dict[str, Any], host: str | None = None) -> Settings
 
 def _serve(listener: socket.socket, settings: Settings, url: str) -> int:
     from service.observability import logs
-    from service.server.malloc import hand_back_memory
-    from service.server.server import Server
+    from service.server.server import Server, hand_back_memory
 
     hand_back_memory()
     logs.configure(settings.log_level, settings.log_format)

@@ -10,26 +10,20 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
-from service.config.prompt_budget import prompt_tokens
 from shared.kit.cores import usable_cores
 from shared.kit.validation_messages import suggestion
-from shared.wire.schemas import Mode, Selection
+from shared.wire.schemas import Features, Mode, PromptFormat, Selection
 
+# Upper bounds in tokens of the embedded model, which has one for each digit: of the static block, and of a row or an
+# experience in each format.
+_STATIC_TOKENS = 800
+_ROW_TOKENS = {"csv": 44, "compact": 12}
+# Of the two further columns of feature preset `reach`.
+_REACH_TOKENS = 16
 # The adapter that this package ships, if it ships one.
 SHIPPED_ADAPTER = Path(__file__).parents[1] / "checkpoints" / "adapter.gguf"
 # The orders' adapter, likewise.
 SHIPPED_ORDERS = SHIPPED_ADAPTER.with_name("orders.gguf")
-
-
-def _default_cache() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aicvds"
-
-
-def _default_store() -> str:
-    home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
-    return str(home / "aicvds" / "missions.db")
-
-
 # The matrices of a small model are small, and the threads synchronise after each product. More than two threads were
 # not measured.
 _MOST_EMBEDDED_THREADS = 8
@@ -43,6 +37,27 @@ _SIMULATORS = {
         *("LORAWAN_DIR", "MQTT_BROKER", "MQTT_PASSWORD", "READINGS_KEY", "WAIT_S"),
     )
 }
+
+
+def prompt_tokens(
+    row_format: PromptFormat, rows: int, experiences: int, features: Features = "paper", demonstrations: str = ""
+) -> int:
+    """Upper bound of a prompt's length in the embedded model's tokens.
+
+    Args:
+        demonstrations: their text, all ASCII: a tokenizer makes at most one token of a character.
+    """
+    row = _ROW_TOKENS[row_format] + (_REACH_TOKENS if features == "reach" else 0)
+    return _STATIC_TOKENS + row * (rows + experiences) + len(demonstrations)
+
+
+def _default_cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aicvds"
+
+
+def _default_store() -> str:
+    home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+    return str(home / "aicvds" / "missions.db")
 
 
 def _json_object(value: object) -> object:

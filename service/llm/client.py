@@ -21,10 +21,9 @@ from pydantic_core import to_json
 from yarl import URL
 
 from service.config.settings import Settings
-from service.llm.answer_reading import completion_of, streamed
+from service.llm.answer_reading import completion_of, connection_fault, excerpt, excerpt_of, pause_of, streamed
 from service.llm.answers import Busy, Completion, NoDecision, NotUnderstood, Unreachable
-from service.llm.request_terms import RequestExtras, RequestTerms
-from service.llm.server_words import connection_fault, excerpt, excerpt_of, pause_of
+from service.llm.request_bodies import RequestExtras, RequestTerms
 
 # Far above any regular completion of two integers; an endless body must not fill the memory.
 _MAX_RESPONSE_BYTES, _BYTES_A_TOKEN = 256 * 1024, 8 * 1024

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager
 from contextvars import Context
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from service.config.settings import Settings
 from service.llm.adapter_version import AdapterUnusable
 from service.llm.answers import Busy, Completion, NoDecision, NotUnderstood, Unreachable
-from service.llm.circuit_breaker import CircuitBreaker, SilenceCounter
 from service.llm.connection import PROBE_TIMEOUT_S, Connection
-from service.llm.decision_priority import DecisionPriority
 from service.llm.embedded import Embed, LoadFailed, embedded
 from service.llm.model_file import ModelMissing
 from service.llm.request_bodies import (
@@ -27,18 +27,65 @@ from service.llm.request_bodies import (
     label_body,
     rewriting_body,
 )
-from service.llm.usability import Usability
+from service.llm.usability import CircuitBreaker, SilenceCounter, Usability
 from shared.wire.reasons import Reason
 from shared.wire.schemas import Readiness
 
-if TYPE_CHECKING:
-    pass
-
+# How often a request is cancelled for a decision, the quiet time that it waits for, and how long it waits at most. Each
+# request evicts the other kind's prefix from the cache. In a mission, decisions come seconds apart.
+_MOST_CANCELLATIONS = 3
+_SILENCE_S = 0.5
+_PATIENCE_S = 10.0
 log = logging.getLogger(__name__)
-
 _RETRY_S = 5.0
 # Message to a call that is cancelled because an earlier call was answered, which is no failure of this server.
 EARLIER_CALL_ANSWERED = "another answered"
+
+
+class DecisionPriority:
+    """The decisions in progress at a server, and the background request that they may cancel."""
+
+    def __init__(self) -> None:
+        self._decisions = 0
+        self._decided_at = -math.inf
+        self._background: asyncio.Task[Completion] | None = None
+
+    @contextmanager
+    def decision(self) -> Iterator[None]:
+        """The time of a request for a decision, which cancels the background request."""
+        self._decisions += 1
+        if self._background is not None:
+            self._background.cancel()
+        try:
+            yield
+        finally:
+            self._decisions -= 1
+            self._decided_at = time.monotonic()
+
+    async def answer(self, ask: Callable[[], Awaitable[Completion]]) -> Completion:
+        """The answer of a background request. Decisions cancel it up to three times; each time it starts again."""
+
+        async def once() -> Completion:
+            return await ask()
+
+        for _ in range(_MOST_CANCELLATIONS):
+            await self._await_silence()
+            self._background = asyncio.create_task(once(), name="llm-rewriting")
+            try:
+                await asyncio.wait({self._background})
+            finally:
+                self._background.cancel()
+            if not self._background.cancelled():
+                return self._background.result()
+        return await ask()
+
+    async def _await_silence(self) -> None:
+        """Wait until no decision has been requested for ``_SILENCE_S``, at most ``_PATIENCE_S``."""
+        started = time.monotonic()
+        while (now := time.monotonic()) < started + _PATIENCE_S:
+            if not self._decisions and now - max(started, self._decided_at) >= _SILENCE_S:
+                return
+            await asyncio.sleep(min(0.1, _SILENCE_S))
 
 
 @dataclass(slots=True)
@@ -55,7 +102,7 @@ class LlmServer:
 
     ``/healthz`` and decisions by the policy go on meanwhile. The states are ``loading``, ``ready``, ``unavailable``
     with the reason in ``detail``, and ``off`` in a mode without LLM. A server that fails again and again is
-    ``unavailable`` too, until a probe is answered: see :mod:`service.llm.circuit_breaker`.
+    ``unavailable`` too, until a probe is answered: see :mod:`service.llm.usability`.
 
     Args:
         warm_up: the first request to a server.

@@ -10,6 +10,7 @@ import asyncio
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Coroutine, Sequence
+from hashlib import blake2b
 from typing import Any, Literal
 
 from service.config.settings import Settings
@@ -17,12 +18,21 @@ from service.llm.answers import Completion, NoDecision
 from service.llm.embedded import Embed, embedded
 from service.llm.request_bodies import Rewriting, WarmUp
 from service.llm.server import EARLIER_CALL_ANSWERED, LlmServer
-from shared.kit.rendezvous import weight
 from shared.wire.reasons import LLM_FAILURES
 from shared.wire.schemas import Readiness
 
 Answer = Coroutine[Any, Any, Completion]
 Call = Callable[[LlmServer], Answer]
+
+
+def weight(key: str, name: str) -> int:
+    """The weight of a name for a key, 0 to 2^64 - 1; the name of the highest weight is the key's.
+
+    Rendezvous hashing (Thaler and Ravishankar 1998): processes that know the same names rank them alike for a key. If a
+    name is removed, only its own keys move, evenly to the others; if it is added again, they return.
+    """
+    # The length keeps ("a", "bc") and ("ab", "c") apart.
+    return int.from_bytes(blake2b(f"{len(key)}:{key}{name}".encode(), digest_size=8).digest())
 
 
 class ServerPool:

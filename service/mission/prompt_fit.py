@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from service.config.prompt_budget import prompt_tokens
+from service.config.settings import prompt_tokens
 from service.errors import Refused
 from service.learning.modules import Weights
 from service.llm.adapter_version import TRAINED_ROWS

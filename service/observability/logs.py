@@ -19,6 +19,8 @@ from shared.wire.schemas import DecideResponse
 log = logging.getLogger(__name__)
 
 _MOST_WAITING = 10_000
+# The fields of an answer that its line has.
+_LOGGED = ("decision_id", "mission_id", "uav_id", "step", "sensor_id", "velocity", "source", "reason", "model")
 # The longest wait for the last lines of a process.
 _LAST_LINES_S = 1.0
 
@@ -129,15 +131,7 @@ def decided(answer: DecideResponse, trace_id: str | None) -> None:
         logging.WARNING if late else logging.INFO,
         "late decision" if late else "decision",
         extra={
-            "decision_id": answer.decision_id,
-            "mission_id": answer.mission_id,
-            "uav_id": answer.uav_id,
-            "step": answer.step,
-            "sensor_id": answer.sensor_id,
-            "velocity": answer.velocity,
-            "source": answer.source,
-            "reason": answer.reason,
-            "model": answer.model,
+            **{name: getattr(answer, name) for name in _LOGGED},
             "total_ms": answer.latency_ms["total"],
             "llm_ms": answer.latency_ms.get("llm"),
             "stored": answer.stored,

@@ -139,16 +139,9 @@ def _address(url: str | None) -> dict[str, Any]:
 
 
 def _attributes(answer: DecideResponse) -> dict[str, Any]:
-    attributes = {
-        "aicvds.decision_id": answer.decision_id,
-        "aicvds.mission_id": answer.mission_id,
-        "aicvds.uav_id": answer.uav_id,
-        "aicvds.step": answer.step,
-        "aicvds.source": answer.source,
-        "aicvds.sensor_id": answer.sensor_id,
-        "aicvds.velocity": answer.velocity,
-    }
-    return attributes if answer.reason is None else {**attributes, "aicvds.reason": answer.reason}
+    names = ("decision_id", "mission_id", "uav_id", "step", "source", "sensor_id", "velocity", "reason")
+    found = {f"aicvds.{name}": getattr(answer, name) for name in names}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def _ns(milliseconds: float) -> int:

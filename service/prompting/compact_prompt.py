@@ -122,7 +122,7 @@ class CompactTemplate(GuidedTemplate):
     """The template of the compact prompt; its rows are shuffled, and its letters carry no rank.
 
     It has no note. The caller gives :meth:`candidates` a state in which the note's orders are queues:
-    :mod:`service.deciding.prompt_view`.
+    :mod:`service.deciding.attended_state`.
     """
 
     # The adapter is trained on soft targets: 0.23 is the mean of its highest probability among some 20 candidates. In

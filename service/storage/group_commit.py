@@ -17,9 +17,8 @@ from itertools import islice
 
 from service.observability.metrics import Metrics
 from service.storage.leases import LeaseLost
-from service.storage.operations import Change, Checkpoint, Entry
+from service.storage.operations import Change, Checkpoint, Entry, WriteFailed, Writer
 from service.storage.store import cause
-from service.storage.writer import WriteFailed, Writer
 
 log = logging.getLogger(__name__)
 

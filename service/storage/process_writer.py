@@ -11,10 +11,9 @@ from contextlib import suppress
 import msgpack
 
 from service.storage import sqlite_process
-from service.storage.operations import Change
+from service.storage.operations import Change, Done, WriteFailed
 from service.storage.rows import PACK_BYTES, Statements
 from service.storage.sqlite_process import LENGTH, identity
-from service.storage.writer import Done, WriteFailed
 
 log = logging.getLogger(__name__)
 

@@ -2,7 +2,7 @@
 
 :class:`service.storage.process_writer.ProcessWriter` runs it and is connected by a socket. Each message is MessagePack
 after its length in four bytes. A request is a transaction, a list of [SQL, rows]. Its answer is nil, or the failure as
-the arguments of :class:`service.storage.writer.WriteFailed`.
+the arguments of :class:`service.storage.operations.WriteFailed`.
 
 The process ends when the socket is closed, after its last commit, even if the edge was killed. It imports very little,
 so that it takes 17 MB and starts in a twentieth of a second.

@@ -15,12 +15,11 @@ from service.mission.events import Event
 from service.mission.resolved_spec import ResolvedSpec
 from service.storage.leases import Leases
 from service.storage.locks import FileLock, StoreUnusable
+from service.storage.operations import Writer
 from service.storage.process_writer import ProcessWriter
-from service.storage.rows import Statements, decode, unpack
-from service.storage.schema import SCHEMA, checkpoints, journal, missions
+from service.storage.rows import SCHEMA, Statements, checkpoints, decode, journal, missions, unpack
 from service.storage.sqlite_process import BUSY_MS, PRAGMAS
 from service.storage.thread_writer import ThreadWriter
-from service.storage.writer import Writer
 from shared.wire.schemas import MissionSpec
 
 # Time limits of PostgreSQL: to connect; for a statement or a silent network; for an edge that is paused or disconnected

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 import sqlalchemy as sa
 
 from service.storage.leases import LeaseLost, Leases
-from service.storage.operations import Change
+from service.storage.operations import Change, Done
 from service.storage.rows import Statement, Statements
-from service.storage.writer import Done
 
 if TYPE_CHECKING:
     # The driver is of the extra `postgres`.

@@ -141,7 +141,7 @@ class FleetBelief:
             queue: shape ``(n,)``, packets at the start of that step.
             battery: shape ``(n,)``, joules.
         """
-        from shared.belief.beacon_updates import take_beacons
+        from shared.belief.arrivals import take_beacons
 
         # numpy raises an error for an unknown sensor ID; compiled code would not.
         self.places[ids] = places
@@ -183,7 +183,7 @@ class FleetBelief:
         The transmission of the UAV's last step was over the same link as the beacon now. If it failed although that
         link is good, the sensor's radio failed.
         """
-        from shared.belief.beacon_updates import in_range
+        from shared.belief.arrivals import in_range
 
         last = self.uavs[uav]
         if last.taught == last.step:

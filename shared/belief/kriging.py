@@ -2,23 +2,25 @@
 
 Without numba it is plain Python: a measurement takes 2 ms, the comparison of the kinds of shadowing up to 0.4 s.
 
-Symmetric matrices are packed, as :class:`~shared.belief.radio_map_arrays.Measurements` has them.
+Symmetric matrices are packed, as :class:`~shared.belief.shadowing.Measurements` has them.
 """
 
 import math
 
-from shared.belief.radio_map_arrays import (
+from shared.belief.shadowing import (
     EAST,
     EXCESS,
     MEASURED,
     NOISE,
     NORTH,
+    OFFSET_WEIGHT,
     ONES,
+    PRIOR_DB,
+    PRIOR_WEIGHT,
     TAKEN,
     LinkStatistics,
     Measurements,
 )
-from shared.belief.shadowing import OFFSET_WEIGHT, PRIOR_DB, PRIOR_WEIGHT
 from shared.kit.compiled import compiled, inlined
 from shared.world.channel import FloatArray, IntArray
 

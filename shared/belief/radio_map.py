@@ -5,18 +5,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.belief.radio_map_arrays import (
+from shared.belief.shadowing import (
     EAST,
     EXCESS,
+    KINDS,
     MEASURED,
     NOISE,
     NUMBERS,
     ONES,
+    PRIOR_DB,
     TAKEN,
     LinkStatistics,
     Measurements,
 )
-from shared.belief.shadowing import KINDS, PRIOR_DB
 from shared.world.channel import FloatArray, IntArray
 
 # Measurements that a map keeps, of all sensors together and of one.
@@ -168,7 +169,7 @@ class RadioMap:
 
     def _compare(self) -> None:
         """Choose the kind of shadowing with the highest marginal likelihood, the variance at its estimate."""
-        from shared.belief.shadowing_likelihoods import likelihoods
+        from shared.belief.shadowing import likelihoods
 
         self.kind = KINDS[int(np.argmax(likelihoods(self._kept, self.count)))]
         self._factor(np.flatnonzero(self.count))

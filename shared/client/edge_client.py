@@ -89,7 +89,7 @@ class EdgeClient:
     retry is random, at most 0.1 s, and this limit doubles each time up to 2 s; a ``Retry-After`` is honoured up to 5 s.
     Where several edges share their missions, a 421 names the edge that has the mission, and the request goes there at
     once. ``timeout_s`` bounds each wait for the network within one attempt. ``transport`` replaces the network (see
-    :mod:`simulator.flying.lossy_transport`), ``sleep`` the pauses and ``clock`` the time; ``seed`` fixes the draws of
+    :mod:`simulator.flying.edge_session`), ``sleep`` the pauses and ``clock`` the time; ``seed`` fixes the draws of
     the pauses. ``uplink`` selects the part of a report that is sent: all of it (``full``), the changes (``delta``), or
     the sensors that the mission's attention, computed here, keeps (``pruned``). Every call takes the full report, and
     the full report is sent where the edge needs it.

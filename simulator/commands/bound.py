@@ -71,7 +71,7 @@ def _run(options: BoundOptions, console: Console) -> int:
             options.out.parent.mkdir(parents=True, exist_ok=True)
             options.out.touch()
     from simulator.bound.solver import Interrupted
-    from simulator.flying.rollout import rollout
+    from simulator.flying.flight import rollout
     from simulator.policies.registry import policy_named
 
     with console.status("Searching for the best flight; Ctrl-C ends the search"):

@@ -10,8 +10,7 @@ from shared.client.edge_client import EdgeClient
 from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
 from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
 from shared.world.scenario import Scenario
-from simulator.policies.policy import LearningPolicy, Policy
-from simulator.policies.registry import policy_named
+from simulator.policies.registry import LearningPolicy, Policy, policy_named
 from simulator.records.decision import DecidedBy
 from simulator.world.observation import Observation
 from simulator.world.observation_report import decide_request

@@ -188,7 +188,7 @@ def _fly_again(job: Job, mode: Mode, edge: EdgeClient, console: Console) -> list
 
 def _others(job: Job, flight: Flight, console: Console, alive: Callable[[], None]) -> dict[str, list[StepTally]]:
     """The tallies of the policies to compare with, over the steps flown; a mode that failed is left out."""
-    from simulator.flying.rollout import baselines
+    from simulator.flying.flight import baselines
 
     modes = [name.partition(":")[2] for name in job.against if name.startswith(EDGE_MODE)]
     local = [name for name in job.against if not name.startswith(EDGE_MODE)]

@@ -1,14 +1,59 @@
-"""The hand-written policies; but for the random one, all fly at 7 m/s throughout."""
+"""The hand-written policies.
+
+EOF and WQCS are the paper's; docs/reference/method.md has our readings where its text is open. Their velocity follows
+the distance to the chosen sensor, by the velocity strategy of the paper's prompt. Its UAVs choose independently; a
+coordinated scheme also leaves out the sensors that earlier UAVs of the step chose. All others fly at 7 m/s throughout,
+but for the random one.
+"""
 
 from abc import ABC, abstractmethod
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.world.channel import FloatArray, path_loss_db
+from shared.world.channel import FloatArray, path_loss_db, whole_rate_bps
 from shared.world.scenario import Scenario
-from simulator.policies.reach import best_in_reach, cruise_velocity, free_sensors, in_reach
 from simulator.world.observation import Observation
+
+# Within this distance, m, a UAV flies at most at half of the highest velocity.
+_NEAR_M = 50.0
+
+
+def cruise_velocity(scenario: Scenario) -> int:
+    """The constant velocity of a policy that does not control it: 7 m/s, half of the paper's range."""
+    return min(7, scenario.max_velocity)
+
+
+def free_sensors(count: int, taken: frozenset[int]) -> NDArray[np.bool_]:
+    """Mask of the sensors that no earlier UAV of this step chose, shape ``(J,)``; all of them if none is free."""
+    free = np.ones(count, dtype=np.bool_)
+    free[list(taken)] = False
+    return free if free.any() else ~free
+
+
+def in_reach(observation: Observation, taken: frozenset[int]) -> NDArray[np.bool_]:
+    """Mask of the free sensors in radio range now, shape ``(J,)``."""
+    heard_now = observation["last_heard"] == observation["step"]
+    return np.asarray(heard_now & free_sensors(len(observation["queue"]), taken))
+
+
+def longest_unheard(observation: Observation, taken: frozenset[int]) -> int:
+    """The free sensor heard longest ago, never heard ones first; of equals the nearest."""
+    free = np.flatnonzero(free_sensors(len(observation["queue"]), taken))
+    distance = np.hypot(*(observation["sensor_position"][free] - observation["position"]).T)
+    return int(free[np.lexsort((distance, observation["last_heard"][free]))[0]])
+
+
+def best_in_reach(score: NDArray[np.float64], observation: Observation, taken: frozenset[int]) -> int:
+    """The sensor in reach with the highest score; with none in reach, the one heard longest ago.
+
+    Args:
+        score: shape ``(J,)``; of equals the lowest index wins.
+    """
+    reachable = in_reach(observation, taken)
+    if not reachable.any():
+        return longest_unheard(observation, taken)
+    return int(np.argmax(np.where(reachable, score, -np.inf)))
 
 
 class _HighestScore(ABC):
@@ -128,3 +173,64 @@ class RandomChoice:
         """Sensor and velocity."""
         free = np.flatnonzero(free_sensors(len(observation["queue"]), taken))
         return int(self._rng.choice(free)), int(self._rng.integers(self._levels))
+
+
+def velocity_by_distance(distance_m: float, scenario: Scenario) -> int:
+    """0 at the sensor, 1 to 7 m/s within 50 m and 8 to 14 beyond, linear in the distance up to the radio radius."""
+    levels = (0, scenario.max_velocity // 2, scenario.max_velocity)
+    return int(np.ceil(np.interp(distance_m, (0.0, _NEAR_M, max(scenario.radio_radius_m, _NEAR_M + 1.0)), levels)))
+
+
+class _PaperScheme(ABC):
+    """The sensor in reach with the highest priority; with none in reach, the one heard longest ago."""
+
+    def __init__(self, coordinated: bool = False) -> None:
+        self._coordinated = coordinated
+
+    def reset(self, scenario: Scenario, seed: int) -> None:
+        """Start a mission; the seed is not used."""
+        self._scenario = scenario
+
+    @abstractmethod
+    def priority(self, uav: int, observation: Observation) -> FloatArray:
+        """The priority of every sensor, shape ``(J,)``."""
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
+        """Sensor and velocity."""
+        known = taken if self._coordinated else frozenset()
+        sensor = best_in_reach(self.priority(uav, observation), observation, known)
+        distance = np.hypot(*(observation["sensor_position"][sensor] - observation["position"]))
+        return sensor, velocity_by_distance(float(distance), self._scenario)
+
+
+class EarliestOverflowFirst(_PaperScheme):
+    """EOF: the channel's power gain over the expected steps until overflow, ``(W - q_j) / growth_j``.
+
+    The growth, packets a step, is the newest rise of the queue between two beacons that the UAV heard; before the first
+    rise it is the scenario's mean arrival rate.
+    """
+
+    def reset(self, scenario: Scenario, seed: int) -> None:
+        """Start a mission; the seed is not used."""
+        super().reset(scenario, seed)
+        shape = (scenario.uavs, scenario.sensors)
+        self._growth = np.full(shape, max(scenario.mean_arrival_rate, 1e-9))
+        self._queue, self._heard = np.zeros(shape), np.full(shape, -1)
+
+    def priority(self, uav: int, observation: Observation) -> FloatArray:
+        """Power gain over steps."""
+        queue, heard = observation["queue"], observation["last_heard"]
+        rise = (queue - self._queue[uav]) / np.maximum(heard - self._heard[uav], 1)
+        # A fall is a collection, which says nothing about arrivals.
+        self._growth[uav] = np.where((self._heard[uav] >= 0) & (rise > 0), rise, self._growth[uav])
+        self._queue[uav], self._heard[uav] = queue, heard
+        room = np.maximum(self._scenario.queue_capacity - queue, 1e-3)
+        return np.asarray(10.0 ** (observation["channel_gain"] / 10.0) * self._growth[uav] / room)
+
+
+class WeightedQueueChannel(_PaperScheme):
+    """WQCS: queue times achievable rate."""
+
+    def priority(self, uav: int, observation: Observation) -> FloatArray:
+        """Packets times bit/s."""
+        return np.asarray(observation["queue"] * whole_rate_bps(-observation["channel_gain"], self._scenario))

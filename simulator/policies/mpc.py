@@ -6,7 +6,7 @@ from shared.belief.fleet_belief import FleetBelief
 from shared.planning.receding import Draft, RecedingHorizon
 from shared.world.actions import Action
 from shared.world.scenario import Scenario
-from simulator.policies.reach import longest_unheard
+from simulator.policies.hand_written import longest_unheard
 from simulator.world.observation import Observation
 
 

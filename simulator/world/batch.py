@@ -4,21 +4,53 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, TypeVar, cast
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from shared.world.channel import FloatArray, IntArray, Links
 from shared.world.scenario import SCENARIOS, Scenario
 from shared.world.step_rule import joules_a_packet, transfer
-from simulator.world.fleet import Fleet
+from shared.world.trajectory import Trajectory, trajectories
 from simulator.world.gain_trace import GainTrace
 from simulator.world.observation import Cost, Observation, StepTally
 from simulator.world.sensors import Sensors, Streams
 from simulator.world.truth import Truth
 
 _T = TypeVar("_T")
+
+
+@dataclass(frozen=True, eq=False)
+class Fleet:
+    """I UAVs, each on its trajectory; of B worlds both arrays have a first dimension B.
+
+    Attributes:
+        trajectories: one a UAV.
+        start_m: shape ``(I,)``, arc length from each trajectory's beginning to the UAV's start.
+        progress_m: shape ``(I,)``, ``start_m`` plus the distance flown.
+    """
+
+    trajectories: tuple[Trajectory, ...]
+    start_m: FloatArray
+    progress_m: FloatArray
+
+    @classmethod
+    def draw(cls, scenario: Scenario, rng: np.random.Generator) -> Self:
+        """A scenario's fleet, each start uniform along its trajectory."""
+        paths = trajectories(scenario)
+        start_m = rng.uniform(0.0, 1.0, len(paths)) * [path.length_m for path in paths]
+        return cls(paths, start_m, start_m)
+
+    @property
+    def positions(self) -> FloatArray:
+        """The UAVs' current positions, shape ``(I, 2)``, metres."""
+        return self.at(self.progress_m)
+
+    def at(self, progress_m: ArrayLike) -> FloatArray:
+        """The UAVs' positions at arc lengths ``(..., I)`` along their trajectories, ``(..., I, 2)``, metres."""
+        progress = np.asarray(progress_m, dtype=np.float64)
+        return np.stack([path.at(progress[..., uav]) for uav, path in enumerate(self.trajectories)], axis=-2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from shared.world.channel import IntArray
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.world.batch import BatchStep, Draw, VectorWorld, stacked
-from simulator.world.fleet import Fleet
+from simulator.world.batch import BatchStep, Draw, Fleet, VectorWorld, stacked
 from simulator.world.gain_trace import GainTrace
 from simulator.world.observation import Cost, Info, Observation, StepTally
 from simulator.world.sensors import Sensors
@@ -59,9 +58,9 @@ class PipelineWorld:
     4. Packets in excess of W at a sensor are lost (g = 1 for that sensor), and its queue is W.
 
     ## What the model leaves out
-    The fields of :class:`shared.world.unmodelled.Unmodelled`, all off by default, make a world differ from what an edge
+    The fields of :class:`shared.world.scenario.Unmodelled`, all off by default, make a world differ from what an edge
     plans with; docs/reference/worlds.md says how. The path loss is ``mean + own_j + way_j(x, y) + fade_ijt +
-    trace_ij``, within 0..400 dB (:class:`~simulator.world.true_channel.TrueChannel`). A transfer and the beacon after
+    trace_ij``, within 0..400 dB (:class:`~simulator.world.truth.TrueChannel`). A transfer and the beacon after
     it meet the same loss, and ``channel_gain`` is minus all of it. ``progress`` is true. The losses of a dead radio are
     nobody's ``lost_i``. A UAV that left neither flies, hears nor collects.
 

@@ -1,4 +1,4 @@
-"""The ground sensors of one world: their positions, queues, arrivals and batteries."""
+"""The ground sensors of one world: their positions, queues, arrivals and batteries; the streams of random numbers."""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -9,6 +9,24 @@ import numpy as np
 from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario
 from shared.world.step_rule import arrive
+
+
+@dataclass(frozen=True, eq=False)
+class StepNoise:
+    """Normal numbers by instant, of one world or of B worlds: ``keys`` are their seeds, ``()`` or ``(B,)``."""
+
+    keys: IntArray
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> Self:
+        """One world's."""
+        return cls(np.asarray(rng.integers(2**63)))
+
+    def normal(self, instant: int, shape: tuple[int, ...]) -> FloatArray:
+        """Standard normal numbers of an instant, of that shape, or ``(B, *shape)``; one shape only, at one instant."""
+        keys = self.keys.ravel().tolist()
+        drawn = [np.random.default_rng([key, instant]).standard_normal(shape) for key in keys]
+        return np.stack(drawn).reshape(*self.keys.shape, *shape)
 
 
 class Streams(NamedTuple):

@@ -27,7 +27,7 @@ from tests.support.waiting import PATIENCE_S, Gate, until
 def unmarked(monkeypatch: pytest.MonkeyPatch) -> None:
     """``aicvds serve`` in this process leaves its log and its allocator as they are for the tests after it."""
     monkeypatch.setattr("service.observability.logs.configure", lambda *_: None)
-    monkeypatch.setattr("service.server.malloc.hand_back_memory", lambda: None)
+    monkeypatch.setattr("service.server.server.hand_back_memory", lambda: None)
 
 
 def test_help_names_every_command() -> None:

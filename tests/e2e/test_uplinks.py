@@ -15,8 +15,8 @@ import pytest
 from shared.client.edge_client import EdgeClient
 from shared.wire.schemas import FeedbackRequest, Uplink
 from shared.world.scenario import SCENARIOS
+from simulator.flying.edge_session import LossyTransport
 from simulator.flying.flight import fly
-from simulator.flying.lossy_transport import LossyTransport
 from simulator.flying.pilots import EdgePilot, PilotChoice
 from simulator.records.flight import Flight
 from simulator.sites.site import Site

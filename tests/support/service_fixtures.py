@@ -42,8 +42,8 @@ def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 @pytest.fixture
 def left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """An LLM server whose circuit breaker opens stays left alone for longer than any test takes."""
-    monkeypatch.setattr("service.llm.circuit_breaker._PAUSE_S", 3600.0)
-    monkeypatch.setattr("service.llm.circuit_breaker._LONGEST_PAUSE_S", 3600.0)
+    monkeypatch.setattr("service.llm.usability._PAUSE_S", 3600.0)
+    monkeypatch.setattr("service.llm.usability._LONGEST_PAUSE_S", 3600.0)
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

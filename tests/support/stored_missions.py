@@ -20,9 +20,8 @@ from service.config.settings import Settings
 from service.edge.engine import Engine
 from service.mission.mission import Mission
 from service.storage.journal import Journal
-from service.storage.operations import Change
+from service.storage.operations import Change, Writer
 from service.storage.store import Store
-from service.storage.writer import Writer
 from tests.support.running import serving
 from tests.support.storing import empty_store
 from tests.support.waiting import PATIENCE_S, until

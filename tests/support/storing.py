@@ -11,11 +11,10 @@ from tempfile import TemporaryDirectory
 import msgpack
 
 from service.storage.locks import FileLock
-from service.storage.operations import Change
+from service.storage.operations import Change, Done, WriteFailed
 from service.storage.rows import Statements
 from service.storage.sqlite_process import Database
 from service.storage.store import Store
-from service.storage.writer import Done, WriteFailed
 
 
 def empty_store(path: Path) -> Path:

@@ -6,8 +6,8 @@ import asyncio
 from dataclasses import replace
 
 from field.errors import VehicleError
-from field.vehicles.mission_clock import Clock
-from field.vehicles.vehicle import FlightMode, VehicleState
+from field.vehicles.field_flight import Clock
+from field.vehicles.mavlink_vehicle import FlightMode, VehicleState
 from shared.world.trajectory import trajectories
 from simulator.sites.plans.mission_path import MissionItem
 from simulator.sites.site import Site

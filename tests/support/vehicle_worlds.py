@@ -11,7 +11,7 @@ from shared.world.scenario import scenario_named
 from shared.world.trajectory import trajectories
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.projection import Frame
-from simulator.world.fleet import Fleet
+from simulator.world.batch import Fleet
 from simulator.world.sensors import Streams, draw_positions
 from tests.support.airframe import Item
 from tests.support.world_folders import feature, write

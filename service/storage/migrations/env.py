@@ -2,7 +2,7 @@
 
 from alembic import context
 
-from service.storage.schema import metadata
+from service.storage.rows import metadata
 
 context.configure(connection=context.config.attributes["connection"], target_metadata=metadata)
 with context.begin_transaction():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lab.benchmarks.scheme_readings import readings
-from simulator.flying.rollout import rollout
+from simulator.flying.flight import rollout
 from simulator.world.environment import PipelineWorld
 
 

@@ -13,7 +13,7 @@ from lab.experiments.plan import weights_of
 from lab.experiments.schemes import BOUND, OFF, Scheme, at_full_speed, llm, local, over_edge
 from lab.marl import learned
 from shared.world.scenario import Scenario
-from simulator.flying.rollout import rollout
+from simulator.flying.flight import rollout
 from simulator.policies.registry import policy_named
 from simulator.sites.site import Site
 from simulator.world.gain_trace import GainTrace

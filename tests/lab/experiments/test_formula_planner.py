@@ -7,7 +7,7 @@ import pytest
 
 from lab.experiments.formula_planner import FormulaPlanner
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.flying.rollout import rollout
+from simulator.flying.flight import rollout
 from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.world.environment import PipelineWorld
 

@@ -14,7 +14,7 @@ from lab.training_seeds import FIRST_TRAINING_SEED
 from shared.client.errors import EdgeError
 from shared.world.scenario import SCENARIOS
 from simulator.bound.clairvoyant_bound import clairvoyant
-from simulator.flying.rollout import rollout
+from simulator.flying.flight import rollout
 from simulator.policies.registry import policy_named
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld

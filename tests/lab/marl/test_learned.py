@@ -14,7 +14,7 @@ from lab.marl.learned import Learned
 from lab.marl.networks import two_heads
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.errors import UsageError
-from simulator.flying.rollout import rollout
+from simulator.flying.flight import rollout
 from simulator.policies.registry import policy_named
 from simulator.world.environment import PipelineWorld
 

@@ -16,7 +16,7 @@ from lab.marl.learned import Learned
 from lab.marl.networks import IndependentAgents, plain_state
 from lab.marl.paper_madqn import PaperMadqn
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.flying.rollout import rollout
+from simulator.flying.flight import rollout
 from simulator.world.environment import PipelineWorld
 
 PAPER = SCENARIOS["paper"]

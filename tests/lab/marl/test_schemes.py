@@ -13,7 +13,7 @@ from lab.marl import madqn, mappo
 from lab.marl.evaluate import lost_packets
 from lab.marl.training import MarlScheme
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.flying.rollout import rollout
+from simulator.flying.flight import rollout
 from simulator.policies.registry import policy_named
 from simulator.world.environment import PipelineWorld
 

@@ -13,8 +13,7 @@ from field.errors import VehicleError
 from field.vehicles.field_flight import FieldFlight, RealFlight
 from field.vehicles.field_pilot import FieldPilot
 from field.vehicles.field_uav import FieldUav
-from field.vehicles.radio import Beacon, Collected, Radio, Spot
-from field.vehicles.simulated_radio import SimulatedRadio, radio_named
+from field.vehicles.radio import Beacon, Collected, Radio, SimulatedRadio, Spot, radio_named
 from shared.client.edge_client import AsyncEdgeClient, EdgeClient
 from shared.wire.schemas import DecideRequest
 from shared.world.trajectory import trajectories

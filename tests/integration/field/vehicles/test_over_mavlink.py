@@ -13,7 +13,7 @@ import pytest
 from field.vehicles.field_run import FieldJob, run_field_mission
 from field.vehicles.field_uav import LEAST_SPEED_M_S, FieldUav
 from field.vehicles.mavlink_vehicle import MavlinkVehicle, mavlink_vehicle
-from field.vehicles.simulated_radio import SimulatedRadio
+from field.vehicles.radio import SimulatedRadio
 from shared.client.edge_client import EdgeClient
 from simulator.commands.replay import read_logged_mission
 from simulator.records.decision import Decision

@@ -14,9 +14,8 @@ from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 from starlette.testclient import TestClient
 
-from service.cluster.exchange import Exchanged
+from service.cluster.exchange import DECIDED_AT, Answer, Exchanged
 from service.cluster.ingress import OwnersGone, ingress_application
-from service.cluster.merging import DECIDED_AT, Answer
 from service.config.settings import Settings
 from shared.wire.missions import MissionLine, MissionList
 from shared.wire.schemas import Readiness

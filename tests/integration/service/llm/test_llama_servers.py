@@ -11,7 +11,7 @@ import pytest
 
 from service.config.settings import Settings
 from service.llm.model_file import embedded_model
-from shared.kit.rendezvous import weight
+from service.llm.server_pool import weight
 from tests.integration.service.llm.test_server_pool import standing_by
 from tests.support.edge_stub import free_port
 from tests.support.llama_server import running

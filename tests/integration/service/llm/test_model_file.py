@@ -11,8 +11,15 @@ from gguf.quants import dequantize, quantize
 
 from service.config.settings import Settings
 from service.llm import model_file
-from service.llm.model_file import EMBEDDED_NAME, GGUF_NAME, ModelMissing, embedded_model, fetch_model, sha256
-from service.llm.requantize import to_eight_bits
+from service.llm.model_file import (
+    EMBEDDED_NAME,
+    GGUF_NAME,
+    ModelMissing,
+    embedded_model,
+    fetch_model,
+    sha256,
+    to_eight_bits,
+)
 
 Q4_1, Q8_0 = GGMLQuantizationType.Q4_1, GGMLQuantizationType.Q8_0
 

@@ -9,7 +9,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.mission.mission_status import learned_world
+from service.api.mission_answers import learned_world
 from shared.belief.fleet_belief import FleetBelief
 from shared.wire.missions import MissionStatus
 from shared.world.channel import channel_gain_db

@@ -14,7 +14,7 @@ import pytest
 from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
 
-from service.server import connection_limits
+from service.server import server
 from tests.support.processes import serving_edge
 from tests.support.running import serving
 from tests.support.waiting import PATIENCE_S
@@ -53,8 +53,8 @@ def hung_up(address: Address, sent: bytes) -> bool:
 
 def long(begun: bytes, piece: bytes, ended: bytes = b"") -> bytes:
     """A head of a byte more than is taken: nothing of it is on its way when it is refused, and the answer arrives."""
-    pieces = piece * (connection_limits._MOST_BYTES // len(piece))
-    return (begun + pieces)[: connection_limits._MOST_BYTES + 1] + ended
+    pieces = piece * (server._MOST_BYTES // len(piece))
+    return (begun + pieces)[: server._MOST_BYTES + 1] + ended
 
 
 HOST = b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n"
@@ -112,7 +112,7 @@ def test_a_body_in_many_small_chunks_is_no_head() -> None:
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nho"])
 def test_who_does_not_end_its_head_is_hung_up(monkeypatch: pytest.MonkeyPatch, sent: bytes) -> None:
-    monkeypatch.setattr(connection_limits, "_MOST_S", 0.1)
+    monkeypatch.setattr(server, "_MOST_S", 0.1)
     with serving(counting) as url:
         assert hung_up(address_of(url), sent)
 
@@ -122,7 +122,7 @@ def test_nor_does_it_help_to_have_asked_before(monkeypatch: pytest.MonkeyPatch, 
     with serving(counting) as url, socket.create_connection(address_of(url), timeout=PATIENCE_S) as connection:
         connection.sendall(b"GET / HTTP/1.1\r\nhost: localhost\r\n\r\n")
         assert connection.recv(65536).startswith(b"HTTP/1.1 200 ")
-        monkeypatch.setattr(connection_limits, "_MOST_S", 0.1)
+        monkeypatch.setattr(server, "_MOST_S", 0.1)
         # Whatever comes ends uvicorn's own waiting.
         connection.sendall(sent)
         while connection.recv(65536):
@@ -141,7 +141,7 @@ def test_who_has_asked_may_wait_longer_than_that(monkeypatch: pytest.MonkeyPatch
     with serving(patient) as url, ThreadPoolExecutor() as pool:
         waiting = pool.submit(httpx.get, url, timeout=PATIENCE_S)
         assert asked.wait(PATIENCE_S)
-        monkeypatch.setattr(connection_limits, "_MOST_S", 0.1)
+        monkeypatch.setattr(server, "_MOST_S", 0.1)
         # Who came later and said nothing was hung up before.
         assert hung_up(address_of(url), b"")
         may.set()

@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from service.server import connection_limits
+from service.server import server
 from tests.support.processes import serving_edge
 from tests.support.stored_missions import kept
 from tests.support.waiting import PATIENCE_S, until
@@ -44,7 +44,7 @@ def test_those_that_there_are_go_on(tmp_path: Path, report: Callable[..., dict[s
         ExitStack() as crowd,
     ):
         uav.get("/readyz").raise_for_status()
-        files = connection_limits._OTHER_FILES + LEAST
+        files = server._OTHER_FILES + LEAST
         resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (files, files))
         address = urlsplit(url)
         host, port = address.hostname or "", address.port or 0

@@ -14,8 +14,8 @@ from typing import Any
 import httpx
 import pytest
 
+from service.api.mission_answers import status_of
 from service.config.settings import Settings
-from service.mission.mission_status import status_of
 from service.storage import group_commit, journal
 from service.storage.recovery import restore_mission
 from service.storage.store import Store

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.api.mission_answers import status_of
 from service.config.settings import Settings
 from service.mission.mission import Mission
-from service.mission.mission_status import status_of
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal
 from service.storage.recovery import restore_mission

@@ -19,7 +19,7 @@ from service.mission.resolved_spec import ResolvedSpec
 from service.storage.leases import LeaseHolder, LeaseLost, Leases
 from service.storage.locks import StoreUnusable
 from service.storage.operations import Deleted, Made
-from service.storage.schema import SCHEMA
+from service.storage.rows import SCHEMA
 from service.storage.store import Store
 from shared.wire.schemas import MissionSpec
 from tests.support.stored_missions import written

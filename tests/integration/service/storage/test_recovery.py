@@ -21,11 +21,10 @@ from service.mission.idempotency import IdempotentAnswers
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal
-from service.storage.operations import Change, Checkpoint, Entry
+from service.storage.operations import Change, Checkpoint, Done, Entry, WriteFailed, Writer
 from service.storage.recovery import restore_mission
 from service.storage.rows import pack
 from service.storage.store import Store, StoredMission
-from service.storage.writer import Done, WriteFailed, Writer
 from shared.wire.schemas import MissionSpec, Outcome
 from shared.world.actions import Action
 from shared.world.scenario import Scenario

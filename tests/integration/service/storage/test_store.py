@@ -11,7 +11,7 @@ import pytest
 from alembic.config import Config
 
 from service.storage.locks import StoreUnusable
-from service.storage.schema import SCHEMA
+from service.storage.rows import SCHEMA
 from service.storage.store import Store
 
 

@@ -17,9 +17,8 @@ import pytest
 from service.config.settings import Settings
 from service.mission.resolved_spec import ResolvedSpec
 from service.storage.locks import StoreUnusable
-from service.storage.operations import Change, Checkpoint, Deleted, Made
+from service.storage.operations import Change, Checkpoint, Deleted, Made, WriteFailed
 from service.storage.store import Store
-from service.storage.writer import WriteFailed
 from shared.wire.schemas import MissionSpec
 from tests.support.processes import serving_edge
 from tests.support.stored_missions import fly, kept, running, writers, written

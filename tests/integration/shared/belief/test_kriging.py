@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared.belief import kriging, link_expectations, shadowing_likelihoods
+from shared.belief import kriging, link_expectations, shadowing
 from shared.belief.learned_channel import LearnedChannel
 from shared.belief.radio_map import RadioMap
 from shared.belief.shadowing import KINDS, OFFSET_WEIGHT, PRIOR_DB, PRIOR_WEIGHT
@@ -96,7 +96,7 @@ def test_the_likelihoods_are_the_normal_distributions(laps: int) -> None:
         expected.append(-0.5 * every * np.log(variance) - 0.5 * spread)
     kept = np.zeros((*found.excess.shape, 7))
     kept[..., :2], kept[..., 2], kept[..., 3] = found.places, found.excess, found.noise
-    np.testing.assert_allclose(shadowing_likelihoods.likelihoods(kept, found.count), expected, rtol=1e-9)
+    np.testing.assert_allclose(shadowing.likelihoods(kept, found.count), expected, rtol=1e-9)
 
 
 def test_expected_transfers_are_those_of_the_formulas_links_with_the_excess_loss() -> None:
@@ -127,7 +127,7 @@ def test_no_form_of_an_array_is_compiled_anew() -> None:
         kriging.predict,
         kriging.invert,
         kriging.estimated,
-        shadowing_likelihoods._sum,
+        shadowing._sum,
         link_expectations.measured_excess,
         link_expectations.expected_transfers,
     ]

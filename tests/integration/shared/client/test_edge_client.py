@@ -16,7 +16,7 @@ from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused, Edge
 from shared.client.retries_and_redirects import edge_url
 from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec
 from shared.world.scenario import SCENARIOS
-from simulator.flying.lossy_transport import LossyTransport
+from simulator.flying.edge_session import LossyTransport
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation_report import decide_request
 from tests.support.edge_stub import EdgeStub, stub_edge

@@ -11,12 +11,11 @@ import httpx
 import numpy as np
 import pytest
 
-from service.api.attention_weights import attention_of
+from service.api.mission_answers import attention_of, status_of
 from service.config.settings import Settings
 from service.edge.feedback import LearningQueue
 from service.learning.modules import top_k
 from service.mission.mission import Mission
-from service.mission.mission_status import status_of
 from shared.client.edge_client import EdgeClient
 from shared.client.pruned_reports import REFRESH_STEPS, AttentionWeights, PrunedReports
 from shared.features.augmented_state import FEATURES

@@ -10,10 +10,9 @@ from pydantic_core import PydanticSerializationError
 
 from shared.client.edge_client import EdgeClient
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.flying.flight import fly
+from simulator.flying.flight import baselines, fly, rollout
 from simulator.flying.job import BASELINES
 from simulator.flying.pilots import EdgePilot, LocalPilot, PilotChoice
-from simulator.flying.rollout import baselines, rollout
 from simulator.policies.registry import policy_named
 from simulator.records.flight import Flight
 from simulator.records.mission_logs import DecisionLog, read_decisions

@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 from shared.client.edge_client import EdgeClient
 from shared.world.channel import link_holds
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.flying.flight import fly
-from simulator.flying.lossy_transport import LossyTransport
+from simulator.flying.edge_session import LossyTransport
+from simulator.flying.flight import fly, rollout
 from simulator.flying.pilots import EdgePilot, LocalPilot
-from simulator.flying.rollout import rollout
 from simulator.policies.registry import POLICY_NAMES, policy_named
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld

@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.flying.rollout import rollout
-from simulator.policies.policy import Policy
-from simulator.policies.registry import POLICY_NAMES, policy_named
-from simulator.world.batch import VectorWorld
+from simulator.flying.flight import rollout
+from simulator.policies.registry import POLICY_NAMES, Policy, policy_named
+from simulator.world.batch import Fleet, VectorWorld
 from simulator.world.environment import PipelineWorld
-from simulator.world.fleet import Fleet
 from simulator.world.observation import Observation
 from simulator.world.sensors import Sensors, Streams
 from simulator.world.truth import Truth

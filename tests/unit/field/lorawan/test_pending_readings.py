@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from field.lorawan.configuration import Configuration
-from field.lorawan.mqtt_metrics import MqttMetrics
-from field.lorawan.pending_readings import MessageResult, PendingReading, ReadingBuffer
+from field.lorawan.pending_readings import MessageResult, MqttMetrics, PendingReading, ReadingBuffer
 from field.lorawan.uplinks import DeviceMessage, chirpstack, the_things_stack
 from tests.support.lorawan_messages import (
     APPLICATION,

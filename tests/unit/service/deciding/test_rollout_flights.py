@@ -10,8 +10,7 @@ import pytest
 
 from service.deciding import rollout_evaluator
 from service.deciding.rollout_evaluator import evaluate
-from service.deciding.rollout_state import RolloutState
-from service.deciding.sampled_futures import SampledFutures
+from service.deciding.rollout_state import RolloutState, SampledFutures
 from shared.planning.orders import LATE_PACKETS, Guidance, SensorWish
 from shared.world.actions import Action
 from shared.world.scenario import SCENARIOS

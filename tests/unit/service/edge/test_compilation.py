@@ -5,7 +5,7 @@ from __future__ import annotations
 from service.edge.compilation import load_for_event_loop
 from service.prompting import unpruned_state
 from service.prompting.unpruned_state import UnprunedState
-from shared.belief import beacon_updates, link_expectations
+from shared.belief import arrivals, link_expectations
 from shared.belief.fleet_belief import FleetBelief
 from shared.belief.records import take_report
 from shared.features.augmented_state import augment
@@ -15,9 +15,9 @@ from tests.integration.shared.belief.test_belief_updates import WORLD, flown, re
 def test_no_form_of_an_array_is_compiled_anew_once_the_edge_is_ready() -> None:
     """On the event loop every decision would wait for the compiler."""
     functions = [
-        beacon_updates.take_beacons,
-        beacon_updates.take_arrivals,
-        beacon_updates.in_range,
+        arrivals.take_beacons,
+        arrivals.take_arrivals,
+        arrivals.in_range,
         link_expectations.measured_excess,
         link_expectations.expected_transfers,
         link_expectations.transfer,

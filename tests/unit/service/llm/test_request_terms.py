@@ -6,9 +6,8 @@ from typing import Any
 
 import pytest
 
-from service.llm.request_bodies import chat_body, label_body
-from service.llm.request_terms import RequestTerms
-from service.llm.server_words import excerpt, pause_of
+from service.llm.answer_reading import excerpt, pause_of
+from service.llm.request_bodies import RequestTerms, chat_body, label_body
 
 
 def body() -> dict[str, Any]:

@@ -2,9 +2,9 @@ import itertools
 
 import pytest
 
+from service.api.mission_answers import status_of
 from service.errors import Conflict, NotFound
 from service.mission.mission import Mission
-from service.mission.mission_status import status_of
 from shared.wire.schemas import Outcome
 from shared.world.actions import Action
 from tests.support.missions import attended, mission, uav

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
+from service.api.mission_answers import status_of
 from service.errors import Refused
 from service.mission.events import Event, ReadingsMerged
 from service.mission.mission import Mission
-from service.mission.mission_status import status_of
 from shared.wire.readings import SensorReading
 from shared.world.actions import Action
 from tests.support.missions import attended, mission, uav

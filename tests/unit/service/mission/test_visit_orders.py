@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.api.mission_answers import status_of
 from service.mission import visit_orders
-from service.mission.mission_status import status_of
 from service.mission.visit_orders import VisitOrders
 from shared.planning.guidance_messages import GuidanceAnswer
 from shared.planning.orders import NO_GUIDANCE, Guidance, SensorWish

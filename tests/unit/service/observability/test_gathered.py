@@ -3,7 +3,7 @@
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.cluster.merging import gathered
+from service.cluster.exchange import gathered
 from service.observability.metrics import Metrics
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.mission.mission_status import status_of
+from service.api.mission_answers import status_of
 from service.prompting.experiences import Experience, Experiences
 from shared.wire.schemas import MissionSpec, Outcome, PromptStyle, Selection
 from shared.world.actions import Action

@@ -5,8 +5,8 @@ from typing import Any, Literal
 
 import pytest
 
+from service.api.mission_answers import status_of
 from service.errors import Refused
-from service.mission.mission_status import status_of
 from service.prompting.paper_prompt import Template
 from service.prompting.prompt import Prompt
 from shared.wire.schemas import MissionSpec, Outcome, PromptStyle

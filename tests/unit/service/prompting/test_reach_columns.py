@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from service.api.mission_answers import status_of
 from service.deciding.attended_state import AttendedState
-from service.mission.mission_status import status_of
 from shared.features.augmented_state import FEATURES, LEVEL_FEATURES, distances_between, places_ahead
 from shared.wire.schemas import Features, MissionSpec, UavState
 from shared.world.channel import link_holds, packets_per_step

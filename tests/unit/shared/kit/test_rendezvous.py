@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from shared.kit.rendezvous import weight
+from service.llm.server_pool import weight
 
 KEYS = [f"mission-{number}" for number in range(3000)]
 NAMES = ["http://a:8080/v1", "http://b:8080/v1", "http://c:8080/v1"]

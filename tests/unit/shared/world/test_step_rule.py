@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from service.deciding.rollout_flights import FlownWorld, fly_candidates
-from service.deciding.sampled_futures import SampledFutures
+from service.deciding.rollout_evaluator import FlownWorld, fly_candidates
+from service.deciding.rollout_state import SampledFutures
 from shared.planning.annealing import Annealing
 from shared.planning.fleet_problem import FleetProblem, fly
 from shared.planning.queue_chains import QueueChains

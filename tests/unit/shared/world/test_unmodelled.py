@@ -8,15 +8,14 @@ from collections.abc import Iterator
 
 import pytest
 
-from shared.world.scenario import SCENARIOS, Scenario
-from shared.world.unmodelled import Unmodelled
+from shared.world.scenario import SCENARIOS, Scenario, Unmodelled
 from tests.support.places import ROOT
 
 HIDDEN = set(Unmodelled.model_fields)
 # What decides: the edge, and the shared parts that policies on board and the edge use.
 DECIDING = ("service", "shared", "simulator/policies", "lab/marl")
 # The fields' definition, and the presets that set them.
-DEFINING = {"shared/world/unmodelled.py", "shared/world/scenario.py"}
+DEFINING = {"shared/world/scenario.py"}
 
 
 def names_in(source: str) -> Iterator[str]:

@@ -12,7 +12,7 @@ from shared.world.channel import link_holds, packets_per_step
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.bound.clairvoyant_bound import clairvoyant, mission_bound, problem_of, replay
 from simulator.errors import UsageError
-from simulator.flying.rollout import rollout
+from simulator.flying.flight import rollout
 from simulator.policies.registry import POLICY_NAMES, policy_named
 from simulator.sites.site import Site
 from simulator.world.batch import Draw, VectorWorld, stacked

@@ -8,7 +8,7 @@ from shared.world.scenario import SCENARIOS, Scenario
 
 # By name: the fixture that spares the other tests its search replaces the module's function.
 from simulator.bound.clairvoyant_bound import mission_bound
-from simulator.flying.rollout import baselines
+from simulator.flying.flight import baselines
 from simulator.records.summary import LossBound
 from simulator.sites.site import Site
 

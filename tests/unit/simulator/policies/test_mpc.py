@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.flying.rollout import rollout
+from simulator.flying.flight import rollout
 from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.policies.registry import policy_named
 from simulator.world.environment import PipelineWorld

@@ -7,8 +7,8 @@ import pytest
 
 from shared.world.channel import rate_bps
 from shared.world.scenario import SCENARIOS
-from simulator.flying.rollout import rollout
-from simulator.policies.paper_schemes import velocity_by_distance
+from simulator.flying.flight import rollout
+from simulator.policies.hand_written import velocity_by_distance
 from simulator.policies.registry import policy_named
 from simulator.world.environment import PipelineWorld
 from tests.unit.simulator.policies.test_registry import FOUR, NONE, ready, seen

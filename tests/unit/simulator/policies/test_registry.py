@@ -12,9 +12,8 @@ import pytest
 from shared.world.channel import channel_gain_db
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.errors import UsageError
-from simulator.flying.rollout import rollout
-from simulator.policies.policy import Policy
-from simulator.policies.registry import POLICY_NAMES, policy_named
+from simulator.flying.flight import rollout
+from simulator.policies.registry import POLICY_NAMES, Policy, policy_named
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import Observation
 

@@ -10,9 +10,8 @@ import pytest
 
 from shared.wire.names import Names
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.flying.flight import fly
+from simulator.flying.flight import baselines, fly
 from simulator.flying.pilots import LocalPilot
-from simulator.flying.rollout import baselines
 from simulator.records.decision import Decision
 from simulator.records.flight import Flight
 from simulator.records.summary import LossBound, Summary, summarise

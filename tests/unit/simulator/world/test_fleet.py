@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from shared.world.scenario import SCENARIOS
 from shared.world.trajectory import Circle, Polyline
-from simulator.world.fleet import Fleet
+from simulator.world.batch import Fleet
 
 
 def two() -> Fleet:

@@ -9,7 +9,7 @@ from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario
 from shared.world.trajectory import Trajectory, trajectories
 from simulator.world.environment import PipelineWorld
-from simulator.world.wind import Wind
+from simulator.world.truth import Wind
 
 # There and back, from west to east.
 EAST: tuple[tuple[float, float], ...] = ((0.0, 0.0), (3000.0, 0.0))

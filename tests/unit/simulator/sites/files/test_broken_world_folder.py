@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
-from simulator.flying.rollout import rollout
+from simulator.flying.flight import rollout
 from simulator.policies.registry import policy_named
 from simulator.sites.files.world_folder import site_from_folder
 from tests.support.drawn_areas import breach_m

@@ -17,7 +17,7 @@ from shared.world.scenario import Scenario
 from shared.world.trajectory import Polyline, trajectories
 from simulator.commands.options import site_from_options
 from simulator.errors import UsageError
-from simulator.flying.rollout import rollout
+from simulator.flying.flight import rollout
 from simulator.policies.registry import policy_named
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.projection import Frame, centre_of
