@@ -122,7 +122,7 @@ def test_a_note_is_compiled_proposed_and_obeyed_only_once_confirmed(edge: Edge, 
         client.put("/missions/test", json={"mode": "value", "note": NOTE})
     assert len(scribe.asked) == 1
     body = scribe.asked[0]
-    assert body["messages"][-1] == {"role": "user", "content": NOTE.lower()}
+    assert body["messages"][-1] == {"role": "user", "content": NOTE}
     assert f'"{ORDERS}"' in body["grammar"]
 
 
