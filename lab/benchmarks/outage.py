@@ -3,9 +3,9 @@
     python -m lab.benchmarks.outage
 
 It flies scenario `pipeline` with UAVs of at most 11 m/s over an edge in mode `policy`, in the same worlds: without an
-outage, and with one of four steps in mid-mission, in which the UAVs fly at 7 m/s, or go on at the velocity that the
-edge decided last. It prints each one's lost packets and the ratios to the flight without outage, with 95% bootstrap
-intervals over worlds, and writes the same as JSON. A world takes some ten seconds.
+outage, and with one of four steps in mid-mission, in which the UAVs fly at 7 m/s, wait in place, or go on at the
+velocity that the edge decided last, as they do. It prints each one's lost packets and the ratios to the flight without
+outage, with 95% bootstrap intervals over worlds, and writes the same as JSON. A world takes some ten seconds.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from simulator.flying.flight import fly
 from simulator.flying.pilots import EdgePilot, OnBoard
 from simulator.sites.site import Site
 
-VARIANTS = ("none", "of its own", "last decided")
+VARIANTS = ("none", "7 m/s", "in place", "last decided")
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,23 @@ class Outage:
     """Where to write the figures."""
 
 
-class OwnVelocity(OnBoard):
-    """Forgets what the edge decided, and flies at the policy's own velocity."""
+class Constant(OnBoard):
+    """Flies at one velocity, whatever the edge decided."""
+
+    velocity = 7
 
     def follow(self, uav: int, velocity: int) -> None:
-        """Remember nothing."""
+        """Remember the one velocity."""
+        super().follow(uav, self.velocity)
+
+
+class InPlace(Constant):
+    """Waits in place."""
+
+    velocity = 0
+
+
+ON_BOARD = {"7 m/s": Constant, "in place": InPlace, "last decided": OnBoard}
 
 
 class CutOffClient(EdgeClient):
@@ -71,14 +83,13 @@ class CutOffClient(EdgeClient):
 
 def flown(url: str, scenario: Scenario, seed: int, variant: str, outage: int) -> int:
     """The packets lost in one world."""
-    name = f"{variant.replace(' ', '-')}-{seed}"
+    name = f"{VARIANTS.index(variant)}-{seed}"
     with CutOffClient(url, timeout_s=60.0) as client:
         pilot = EdgePilot(client, name, scenario, seed, mode="policy", deadline_ms=30_000)
         client.put_mission(name, pilot.spec)
         if variant != "none":
             client.gone = range(scenario.steps // 2 - 1, scenario.steps // 2 - 1 + outage)
-        if variant == "of its own":
-            pilot.on_board = OwnVelocity(scenario, seed)
+            pilot.on_board = ON_BOARD[variant](scenario, seed)
         tally = fly(Site(scenario), pilot, seed).tally
         client.delete_mission(name)
     return sum(step.lost_packets for step in tally)

@@ -254,13 +254,13 @@ def test_the_operator_gives_orders_and_sees_their_deadlines(visit: Open, edge: s
     page.locator("#structure > summary").click()
     orders = page.locator("#orders-input")
     orders.fill("{")
-    page.get_by_role("button", name="Give these orders").click()
+    page.get_by_role("button", name="Add these orders").click()
     expect(page.locator("#operator-error")).to_contain_text("These orders are no JSON")
     orders.fill('{"sensors": [{"sensor_id": 99, "visit_every": 2}]}')
-    page.get_by_role("button", name="Give these orders").click()
+    page.get_by_role("button", name="Add these orders").click()
     expect(page.locator("#operator-error")).to_contain_text("sensor 99 is unknown")
     orders.fill('{"sensors": [{"sensor_id": 3, "visit_every": 1}], "max_velocity": 9}')
-    page.get_by_role("button", name="Give these orders").click()
+    page.get_by_role("button", name="Add these orders").click()
     expect(summary).to_have_text("Visit sensor 3 in every step. Never fly faster than 9 m/s.")
     expect(page.locator("#operator-error")).to_be_empty()
     for step in (1, 2):
@@ -268,12 +268,12 @@ def test_the_operator_gives_orders_and_sees_their_deadlines(visit: Open, edge: s
     expect(page.locator("#deadlines-list")).to_contain_text("S3, every 1 steps")
     # Step 0 was decided before the orders, and step 2 is not over.
     expect(page.locator("#deadlines-met")).to_contain_text("are over: 1 met, 0 missed")
-    page.get_by_role("button", name="Withdraw the orders").click()
+    page.get_by_role("button", name="Withdraw all orders").click()
     expect(summary).to_have_text("no orders")
     # This edge has no LLM: a note is not understood, and the page says why.
-    page.locator("#note-input").fill("Visit sensor 4 every third step.")
+    page.locator("#note-input").fill("The pipe near sensor 4 hums, look there now and then.")
     page.get_by_role("button", name="Send the note").click()
-    expect(page.locator("#note-text")).to_have_text("Visit sensor 4 every third step.")
+    expect(page.locator("#note-text")).to_have_text("The pipe near sensor 4 hums, look there now and then.")
     expect(page.locator("#note-words")).to_contain_text("the LLM is off")
     assert violations(page) == []
 

@@ -13,5 +13,5 @@ pytestmark = pytest.mark.long
 
 def test_worlds_are_flown_with_an_outage_and_without(tmp_path: Path) -> None:
     lost = figures("lab.benchmarks.outage", "--seeds", "1", "--steps", "10", out=tmp_path / "outage.json")
-    assert set(lost) == {"none", "of its own", "last decided"}
+    assert set(lost) == {"none", "7 m/s", "in place", "last decided"}
     assert all(len(packets) == 1 and packets[0] >= 0 for packets in lost.values())
