@@ -29,7 +29,8 @@ from tests.support.tiny_flights import TINY, decided, declared, flown, setup
 Edge = Callable[..., httpx.Client]
 
 MEANT = Guidance(sensors=[SensorWish(sensor_id=1, visit_every=2)], max_velocity=6)
-NOTE = "Sensor 1 every 2 steps, at most 6 m/s."
+# A note that only an LLM can read.
+NOTE = "The pipe at sensor 1 hums, so somebody should see it every 2 steps; 6 m/s is plenty."
 NOTES = (Intent(note=NOTE, meant=MEANT), Intent(note="Slowly.", meant=NO_GUIDANCE))
 ORDERS = "visit sensor 1 every 2 steps, fly at most 6 m/s"
 
