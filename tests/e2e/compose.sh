@@ -262,7 +262,8 @@ lacks "$edge_image" simulator gymnasium matplotlib pip
 lacks "$simulator_image" service torch scipy xllamacpp pip
 settings=$(docker run --rm --network none --entrypoint python "$edge_image" -c '
 from service.config.settings import Settings
-print(*(f"AICVDS_{name.upper()}" for name in Settings.model_fields if name != "cache_dir"))')
+own = ("cache_dir", "host", "port")
+print(*(f"AICVDS_{name.upper()}" for name in Settings.model_fields if name not in own))')
 for name in $settings; do
   grep -Eq "^      - $name(=.*)?$" docker-compose.yml || fail "docker-compose.yml does not pass $name on"
   grep -q "^#$name=" .env.example || fail ".env.example does not tell of $name"
