@@ -145,8 +145,8 @@ def test_numbers_and_switches_arrive_as_the_edge_writes_them(tmp_path: Path) -> 
 def test_the_schema_lists_every_setting() -> None:
     schema = json.loads((CHART / "values.schema.json").read_text())
     listed = schema["definitions"]["setting"]["enum"]
-    # These have values of their own, or are in Secrets.
-    elsewhere = {"STORE", "LLM_API_KEY", "KEYS", "ADVERTISE_URL"}
+    # These have values of their own, are in Secrets, or in the image's command.
+    elsewhere = {"STORE", "LLM_API_KEY", "KEYS", "ADVERTISE_URL", "HOST", "PORT"}
     assert len(listed) == len(set(listed))
     assert set(listed) == {f"AICVDS_{name.upper()}" for name in Settings.model_fields if name.upper() not in elsewhere}
 
