@@ -188,7 +188,7 @@ def test_a_note_sent_while_it_is_open_is_compiled_when_it_is_well(
         for step in range(3):
             client.post("/decide", json=report(step=step, mission_id="other"))
         assert client.get("/readyz").json()["llm"] == "unavailable"
-        client.put("/missions/test", json={"note": "The pipe at sensor 3 hums, so somebody should see it every 3 steps."})
+        client.put("/missions/test", json={"note": "Sensor 3 hums, so somebody should see it every 3 steps."})
         assert client.get("/missions/test/guidance").json()["status"] == "compiling"
         probes.open()
         until(lambda: client.get("/missions/test/guidance").json()["status"] != "compiling")
