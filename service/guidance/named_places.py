@@ -11,8 +11,9 @@ from shared.world.channel import FloatArray
 from shared.world.scenario import Point
 from shared.world.trajectory import Polyline
 
-# An area or section with more sensors is no order for each of them. Metres: what is on a line; sensors as near to a
-# kilometre as the nearest; and the distance from which that is a doubt.
+# The most sensors that an area or a section may stand for. Then metres: how near to a line a sensor is on it; how much
+# farther from a kilometre than the nearest sensor another may be; how far from the pipeline a sensor counts, and from
+# which distance along it the nearest is doubted.
 _MOST_SENSORS, _NEAR_M, _SAME_M, _FAR_M = 8, 100.0, 50.0, 250.0
 # Words of orders are no names.
 _WORDS = {"sensor", "sensors", "visit", "step", "steps", "every", "never", "speed", "velocity", "weight", "all"}

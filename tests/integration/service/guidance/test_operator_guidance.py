@@ -120,8 +120,7 @@ def test_a_note_is_compiled_proposed_and_obeyed_only_once_confirmed(edge: Edge, 
         assert client.post("/decide", json=report(step=2, uav_id=1)).json()["sensor_id"] != 3
         # Compiled once, and the same PUT again compiles nothing.
         client.put("/missions/test", json={"mode": "value", "note": NOTE})
-    assert len(scribe.asked) == 1
-    body = scribe.asked[0]
+    [body] = scribe.asked
     assert body["messages"][-1] == {"role": "user", "content": NOTE}
     assert f'"{ORDERS}"' in body["grammar"]
 
