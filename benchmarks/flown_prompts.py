@@ -26,8 +26,7 @@ from shared.world.scenario import Scenario
 from simulator.flying.flight import fly
 from simulator.flying.pilots import LocalPilot, PilotChoice
 from simulator.sites.site import Site
-from simulator.world.observation import Observation
-from simulator.world.observation_report import decide_request
+from simulator.world.observation import Observation, decide_request
 
 GUIDED, LLM, PAPER = "guided", "llm", "paper"
 WAYS = {

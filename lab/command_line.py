@@ -9,9 +9,8 @@ from shared.kit.validation_messages import suggestion
 
 _COMMANDS = {
     "experiment": "reproduce a figure or table of the paper, or one beyond it, over many seeds",
-    "explore": "record exploring UAVs on training worlds, for pretrain, distill and demonstrate",
+    "explore": "record exploring UAVs on training worlds, for pretrain and distill",
     "pretrain": "train the attention and velocity modules' start on what explore recorded",
-    "demonstrate": "choose worked examples for the prompt from what explore recorded",
     "distill": "train the embedded LLM's adapter on what explore recorded",
     "distill-orders": "train the adapter that reads operators' notes",
     "train": "train the learned baselines, MADQN and MAPPO",

@@ -12,8 +12,7 @@ from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mod
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
 from simulator.flying.pilots import OnBoard, PilotChoice, reason_on_board
-from simulator.world.observation import Observation
-from simulator.world.observation_report import decide_request
+from simulator.world.observation import Observation, decide_request
 
 
 class FieldPilot:

@@ -21,8 +21,7 @@ from shared.wire.schemas import DecideRequest, MissionSpec, Outcome
 from shared.wire.sensor_arrays import arrays_of
 from shared.world.actions import Action
 from shared.world.scenario import Scenario
-from simulator.world.observation import Observation
-from simulator.world.observation_report import decide_request
+from simulator.world.observation import Observation, decide_request
 
 
 @cache

@@ -18,7 +18,7 @@ from lab.experiments.evidence import ZERO
 from lab.experiments.intervals import interval, paired
 from lab.experiments.result import Paired
 from shared.world.channel import FloatArray
-from simulator.records.statistics import jain_index
+from simulator.records.decision import jain_index
 
 # Steps of the moving average, and the fewest that it takes at a mission's end.
 WINDOW, LEAST_REMAINING = 5, 3

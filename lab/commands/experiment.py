@@ -16,6 +16,7 @@ from lab.experiments.catalogue import ALL, EXPERIMENTS
 from lab.experiments.edges import Llm
 from lab.experiments.plan import QUICK_LLM_SEEDS, QUICK_SEEDS, Experiment, Setup
 from lab.experiments.result import Result
+from lab.scenario_changes import ScenarioChanges
 from shared.kit.ray_connection import RayUnusable
 from shared.kit.validation_messages import suggestion
 from simulator.commands.options import check_between, edge_from_option, site_from_options
@@ -26,8 +27,8 @@ SEEDS, LLM_SEEDS = 30, 10
 PAGE, MAP, FIGURES = "page", "claims-map", "paper-figures"
 
 
-@dataclass(frozen=True)
-class ExperimentOptions:  # noqa: D101
+@dataclass(frozen=True, kw_only=True)
+class ExperimentOptions(ScenarioChanges):  # noqa: D101
     __doc__ = f"""Make a figure or table of the paper, or one beyond it, over many worlds.
 
     NAME is one of these, or `{ALL}` for every one:
@@ -139,9 +140,9 @@ def setup_of(options: ExperimentOptions) -> Setup:
             raise UsageError(f"--model {model}: there is no such file")
     if options.llm not in ("embedded", "none") and not options.llm.startswith(("http://", "https://")):
         raise UsageError(f"--llm {options.llm}: choose embedded, none, or a URL such as http://127.0.0.1:8080/v1")
-    site = site_from_options(options.scenario, options.world, options.steps)
+    site = site_from_options(options.scenario, options.world, options.steps, options.changes)
     sites = {site.scenario.name: site}
-    if options.scenario is None:
+    if options.scenario is None and not options.changes:
         named = dict.fromkeys(name for each in EXPERIMENTS.values() for name in each.worlds)
         sites |= {name: site_from_options(name, None, options.steps) for name in named if name not in sites}
     pace: Literal["full", "quick"] = "quick" if options.quick else "full"

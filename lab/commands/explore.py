@@ -17,8 +17,11 @@ from tyro.conf import arg
 from lab.executors import ordered_map
 from lab.exploration.exploration import explore
 from lab.exploration.rollouts import Header, RolloutStep, write_rollouts
+from lab.scenario_changes import ScenarioChanges
 from shared.client.errors import EdgeError
-from shared.world.scenario import Scenario, scenario_named
+from shared.world.scenario import Scenario
+from simulator.commands.options import scenario_from_options
+from simulator.errors import UsageError
 from simulator.policies.registry import policy_named
 
 # The world and the planner take seconds to import; `--help` and bad use answer without them.
@@ -32,12 +35,11 @@ _BEHAVIOUR = "taught: mostly the reference's; untaught: half a heuristic's, half
 _READY_S = 30.0
 
 
-@dataclass(frozen=True)
-class Explore:
+@dataclass(frozen=True, kw_only=True)
+class Explore(ScenarioChanges):
     """Fly training worlds with exploring UAVs, and record each decision, its cost, and a teacher's reference action.
 
-    The worlds' seeds start at 1,000,000, apart from every evaluation seed. The file feeds `python -m lab pretrain` and
-    `python -m lab demonstrate`.
+    The worlds' seeds start at 1,000,000, apart from every evaluation seed. The file feeds `python -m lab pretrain`.
 
       python -m lab explore --workers 2 --out runs/rollouts.jsonl.gz
 
@@ -85,7 +87,7 @@ def main(argv: list[str]) -> int:
     """Run ``python -m lab explore``; returns the exit code."""
     args = tyro.cli(Explore, prog="python -m lab explore", args=argv)
     try:
-        scenario = scenario_named(args.scenario)
+        scenario = scenario_from_options(args.scenario, changes=args.changes)
         if args.edge is not None and args.policy is not None:
             raise ValueError("--edge and --policy exclude each other: name whose decisions are flown")
         for name in ("missions", "untaught", "first"):
@@ -103,7 +105,7 @@ def main(argv: list[str]) -> int:
         behaviour = args.policy or (_BEHAVIOUR if args.edge is None else "an edge's decisions")
         header = Header(scenario=scenario, missions=args.missions + args.untaught, behaviour=behaviour)
         write_rollouts(args.out, header, _explored(scenario, args))
-    except (ValueError, OSError, EdgeError) as error:
+    except (ValueError, OSError, EdgeError, UsageError) as error:
         print(f"python -m lab explore: {error}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as missing:

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from lab.marl.plan import MOST_EPISODES, STATE, TrainingPlan
+from lab.scenario_changes import ScenarioChanges
 from shared.world.scenario import Scenario
 from simulator.commands.options import check_between, check_seed, scenario_from_options
 from simulator.commands.running import command_main
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
 _EXTRA = "Install the extra: pip install -e '.[lab]'"
 
 
-@dataclass(frozen=True)
-class Train:
+@dataclass(frozen=True, kw_only=True)
+class Train(ScenarioChanges):
     """Train a learned baseline: MADQN or MAPPO.
 
     MADQN: independent deep Q-learning with one network for all UAVs, 1000 episodes. MAPPO: actors with a centralised
@@ -84,7 +85,7 @@ def train(options: Train, command: str, console: Console) -> int:
     Raises:
         UsageError: the options are unusable, the folder has another training, or the extra ``marl`` is not installed.
     """
-    scenario = scenario_from_options(options.scenario)
+    scenario = scenario_from_options(options.scenario, changes=options.changes)
     check(options)
     out = options.out or Path("runs") / options.scheme
     if (out / STATE).exists() and not options.resume:

@@ -15,7 +15,7 @@ from typing import Any
 from lab.experiments.schemes import Scheme
 from shared.planning.guidance_messages import GuidanceState
 from shared.planning.orders import Guidance
-from simulator.records.record import Record
+from simulator.records.decision import Record
 from simulator.records.run_folder import naming_out
 from simulator.sites.site import Site
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from shared.belief.arrivals import Arrivals
 from shared.belief.drift import Drift
-from shared.belief.fleet_belief import FleetBelief
-from shared.belief.gain_measurements import NOTHING_MEASURED, Measured
+from shared.belief.fleet_belief import NOTHING_MEASURED, FleetBelief, Measured
 from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario
 from shared.world.trajectory import Trajectory

@@ -6,8 +6,6 @@ from lab.experiments.measures import LOSSES
 from lab.experiments.plan import Experiment, FigureSpec, Setup
 from lab.experiments.schemes import CHANCE, NAMED_BY_OPTION, Scheme, edge_policy, guided, local, over_edge, value
 
-_DEMONSTRATIONS = 6
-
 
 def _schemes(setup: Setup) -> list[Scheme]:
     embedded = "SmolLM2-135M (embedded)" if setup.llm.embedded else "the LLM of --llm"
@@ -15,15 +13,7 @@ def _schemes(setup: Setup) -> list[Scheme]:
         *((f"llm_{path.stem}", path.stem, str(path)) for path in setup.models),
         ("llm", embedded, NAMED_BY_OPTION),
     ]
-    shown = {"demonstrations": _DEMONSTRATIONS}
-    of_llms = [
-        scheme
-        for name, label, backing in backings
-        for scheme in (
-            over_edge(name, label, backing=backing),
-            over_edge(f"{name}_shown", f"{label}, {_DEMONSTRATIONS} demonstrations", backing=backing, prompt=shown),
-        )
-    ]
+    of_llms = [over_edge(name, label, backing=backing) for name, label, backing in backings]
     chance = over_edge("llm_chance", "uniform draws in place of an LLM", backing=CHANCE)
     return [*of_llms, chance, guided(), value(), edge_policy(), local("eof"), local("random")]
 
@@ -31,7 +21,7 @@ def _schemes(setup: Setup) -> list[Scheme]:
 EXPERIMENT = Experiment(
     name="llm-models",
     title="By the LLM backings",
-    summary="each --model GGUF and the embedded LLM, with demonstrations and without, beside uniform draws and no LLM",
+    summary="each --model GGUF and the embedded LLM, beside uniform draws and no LLM",
     schemes=_schemes,
     measures=(*LOSSES, "failures", "overflows", "rtt_p50", "llm_decided_pct"),
     figures=(
@@ -42,7 +32,6 @@ EXPERIMENT = Experiment(
     notes=(
         "Only models at hand are measured: SmolLM2-135M is the one that ships; give others with --model FILE.gguf. "
         "What a larger model would do is not known from this.",
-        "Demonstrations are worked examples in the static block, solved by the planner on training worlds.",
         "Uniform draws: same attention, same k, same checks, an answer drawn uniformly among those allowed. An LLM "
         "that does not beat it adds nothing.",
     ),

@@ -9,8 +9,8 @@ from itertools import accumulate
 import numpy as np
 
 from lab.experiments.flight import DecisionRecord, FlightRecord, TokenCounts
-from shared.planning.visit_deadlines import count_deadlines
-from simulator.records.statistics import jain_index
+from shared.planning.orders import count_deadlines
+from simulator.records.decision import jain_index
 
 # Prefixes of the reasons of decisions taken because the LLM gave none. `no_candidate` is none of them, since the LLM
 # had no question to answer.
@@ -73,7 +73,7 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def _deadlines_met(flight: FlightRecord) -> float | None:
-    """The percentage of the requested visits' deadlines that were met: :mod:`shared.planning.visit_deadlines`."""
+    """The percentage of the requested visits' deadlines that were met: :mod:`shared.planning.orders`."""
     met = total = 0
     for wish in flight.meant.sensors if flight.meant is not None else []:
         if wish.visit_every is not None:

@@ -8,7 +8,7 @@ from typing import Literal
 from shared.client.edge_client import EdgeClient
 from shared.planning.guidance_messages import GuidanceAnswer, GuidanceState
 from shared.planning.orders import Guidance
-from simulator.records.record import Record
+from simulator.records.decision import Record
 
 _WAIT_S = 300.0
 _POLL_S = 0.2

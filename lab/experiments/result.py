@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Literal
 
-from simulator.records.record import Record
+from simulator.records.decision import Record
 
 
 class Interval(Record):

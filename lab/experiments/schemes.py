@@ -9,7 +9,7 @@ from pydantic import Field
 from lab.experiments.operators import Operator
 from lab.experiments.uplinks_of_sensors import UplinkPlan
 from shared.wire.schemas import MissionSpec
-from simulator.records.record import Record
+from simulator.records.decision import Record
 
 # So long that the speed of this machine does not change an edge's decisions.
 GENEROUS_DEADLINE_MS = 30_000

@@ -9,7 +9,7 @@ import numpy as np
 from shared.client.edge_client import EdgeClient
 from shared.wire.readings import MAX_READINGS, ReadingsRequest, SensorReading
 from shared.world.scenario import Scenario
-from simulator.records.record import Record
+from simulator.records.decision import Record
 
 # The world takes a second to import; the experiments' `--help` does without it.
 if TYPE_CHECKING:

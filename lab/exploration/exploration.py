@@ -45,7 +45,7 @@ def explore(
     """
     from lab.exploration.teachers import TEACHERS
     from simulator.world.environment import PipelineWorld
-    from simulator.world.observation_report import decide_request
+    from simulator.world.observation import decide_request
 
     world = PipelineWorld(scenario)
     observations, _ = world.reset(seed=FIRST_TRAINING_SEED + mission)

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
+from lab.scenario_changes import ScenarioChanges
 from shared.world.scenario import Scenario
 from simulator.commands.options import check_between, scenario_from_options
 from simulator.commands.running import command_main
@@ -20,8 +21,8 @@ FigureName = Literal["losses", "attention", "top-k", "tokens", "round-trips", "v
 RUNS, QUICK_RUNS, ATTENTION_RUNS, ATTENTION_STEPS, TRIP_RUNS = 10, 3, 5, 20, 5
 
 
-@dataclass(frozen=True)
-class FigureOptions:
+@dataclass(frozen=True, kw_only=True)
+class FigureOptions(ScenarioChanges):
     """Draw the paper's figures as it draws them, with at most five curves, and write their numbers as CSV.
 
     Look-ahead stands in the LLM's place behind attention; only the round trips ask an LLM. losses: lost packets by step
@@ -60,7 +61,7 @@ def paper_figures(options: FigureOptions, console: Console) -> int:
         UsageError: an option is out of bounds, or the folder cannot be written.
         EdgeError: the edge of the round trips died, or lacks its LLM.
     """
-    scenario = scenario_from_options(options.scenario)
+    scenario = scenario_from_options(options.scenario, changes=options.changes)
     runs = options.runs if options.runs is not None else QUICK_RUNS if options.quick else RUNS
     check_between("--runs", runs, 2, 1000)
     # Torch, numba and matplotlib take seconds to import.

@@ -19,7 +19,7 @@ from lab.experiments.plots import PRINT, rounded
 from lab.paper_figures.measured import Trips
 from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario
-from simulator.records.statistics import jain_index
+from simulator.records.decision import jain_index
 from simulator.reporting.figure_style import DOUBLE_IN, SINGLE_IN
 from simulator.reporting.figures import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
 

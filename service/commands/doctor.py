@@ -23,7 +23,7 @@ from shared.kit.validation_messages import problem_of
 from shared.wire.schemas import LLM_MODES
 
 if TYPE_CHECKING:
-    from service.llm.examination import Examination
+    from service.llm.probing import Examination
 
 # A large model on a small machine reads its first prompt slowly.
 _EXAMINED_S = 120.0
@@ -168,7 +168,7 @@ def llm_servers(settings: Settings) -> Iterator[Finding]:
 
 def _llm_server(settings: Settings) -> Iterator[Finding]:
     from service.llm.answers import NoDecision
-    from service.llm.examination import examine
+    from service.llm.probing import examine
     from service.prompting.warm_up import warm_up
 
     async def examined() -> Examination:

@@ -39,16 +39,10 @@ _SIMULATORS = {
 }
 
 
-def prompt_tokens(
-    row_format: PromptFormat, rows: int, experiences: int, features: Features = "paper", demonstrations: str = ""
-) -> int:
-    """Upper bound of a prompt's length in the embedded model's tokens.
-
-    Args:
-        demonstrations: their text, all ASCII: a tokenizer makes at most one token of a character.
-    """
+def prompt_tokens(row_format: PromptFormat, rows: int, experiences: int, features: Features = "paper") -> int:
+    """Upper bound of a prompt's length in the embedded model's tokens."""
     row = _ROW_TOKENS[row_format] + (_REACH_TOKENS if features == "reach" else 0)
-    return _STATIC_TOKENS + row * (rows + experiences) + len(demonstrations)
+    return _STATIC_TOKENS + row * (rows + experiences)
 
 
 def _default_cache() -> Path:

@@ -10,7 +10,6 @@ from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner
 from service.learning.modules import Sample
 from service.learning.softmax_means import softmax_means
-from service.prompting.unpruned_state import UnprunedState
 from shared.belief.fleet_belief import FleetBelief
 from shared.belief.learned_channel import ExpectedLinks
 from shared.belief.records import Records, take_report
@@ -42,7 +41,6 @@ def load_for_event_loop() -> None:
         )
     belief.channel.transfer(0.0)
     ExpectedLinks.by_formula(state.distance[None], _PAPER)
-    UnprunedState(state, ",".join).tokens(len)
 
 
 def _heard(step: int) -> SensorColumns:

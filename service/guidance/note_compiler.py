@@ -23,10 +23,9 @@ from typing import Protocol
 
 from service.guidance.lettered_orders import PARTLY, STATIC, NoteReading, grammar, meaning
 from service.guidance.note_numbers import LetteredNote
-from service.guidance.note_orders import INSTRUCTION, BadOrders, parse_orders, similar_examples
+from service.guidance.note_orders import INSTRUCTION, BadOrders, constrain_orders, parse_orders, similar_examples
 from service.guidance.note_phrases import PhrasedNote
 from service.guidance.operator_guidance import OperatorGuidance
-from service.guidance.order_grammar import constrain_orders
 from service.llm.answers import Completion, NoDecision
 from service.llm.request_bodies import Constraint, Rewriting
 from service.llm.server_pool import ServerPool

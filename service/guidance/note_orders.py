@@ -1,4 +1,4 @@
-"""Orders: the fixed form in which an LLM rewrites an operator's note, and the parser for them.
+"""Orders: the fixed form in which an LLM rewrites an operator's note, its constraint for a server, and the parser.
 
 An order is a phrase with numbers. A note becomes a list of orders separated by commas, or ``nothing``. Every number of
 an order must occur in the note, as digits or as a word, and two orders may not use the same occurrence. This check
@@ -10,10 +10,13 @@ import json
 import math
 import re
 from collections import Counter
+from collections.abc import Sequence
 from functools import cache, lru_cache
 from importlib.resources import files
+from typing import Any
 
 from service.guidance.note_numbers import CARDINALS, ORDINALS
+from service.llm.request_bodies import Constraint
 from shared.planning.orders import Guidance
 
 # Worked examples: notes as operators write them, and their orders.
@@ -24,6 +27,7 @@ INSTRUCTION = "Rewrite the operator's note as orders for the UAVs."
 NOTHING = "nothing"
 SEPARATOR = ", "
 MOST_ORDERS = 6
+_MOST_NUMBERS = 10
 # The examples in the prompt. With 8 of them a model of 135M parameters compiles 22 of 30 held-out notes correctly. The
 # orders of the most similar example with the note's numbers are correct for 17 (lab/benchmarks/notes.py).
 _EXAMPLES_SHOWN = 8
@@ -67,7 +71,7 @@ def parse_orders(text: str, note: str) -> Guidance:
     """
     values: dict[str, float] = {}
     sensors: set[int] = set()
-    for words, numbers in map(parse_order, _orders_in(text)):
+    for words, numbers in map(_parsed, _orders_in(text)):
         name = _NAMES[words].format(numbers[0])
         if name in values:
             raise BadOrders(f"{name} is ordered twice")
@@ -77,6 +81,55 @@ def parse_orders(text: str, note: str) -> Guidance:
     if invented := used - numbers_in(note):
         raise BadOrders(f"the orders use the number {next(iter(invented))} more often than the note")
     return Guidance.of(values, {})
+
+
+def admissible(note: str) -> list[str]:
+    """Every order whose numbers occur in the note, each at most as often as there; ordered by phrase.
+
+    Raises:
+        BadOrders: the note has no number, or too many different ones.
+    """
+    available = numbers_in(note)
+    numbers = list(available)
+    if not numbers:
+        raise BadOrders("the note has no number, and every order needs one: only the prompt contains the note")
+    if len(numbers) > _MOST_NUMBERS:
+        raise BadOrders(f"the note has more than {_MOST_NUMBERS} different numbers")
+    single = [_filled(words, (number,)) for words in (FASTEST, SLOWEST, FORBIDDEN) for number in numbers]
+    pairs = [(first, second) for first in numbers for second in numbers if first != second or available[first] > 1]
+    return [_filled(words, pair) for words in (VISIT, WEIGHT) for pair in pairs] + single
+
+
+def constrain_orders(constraint: Constraint, note: str) -> dict[str, Any]:
+    """The request fields that constrain a server to orders that the note's numbers allow, or ``nothing``.
+
+    They allow orders that use a number more often than the note; ``parse_orders`` refuses these.
+
+    Raises:
+        BadOrders: as :func:`admissible`.
+    """
+    orders = admissible(note)
+    if constraint == "grammar":
+        several = f'order ("{SEPARATOR}" order){{0,{MOST_ORDERS - 1}}}'
+        any_order = " | ".join(f'"{order}"' for order in orders)
+        return {"grammar": f'root ::= "{NOTHING}" | {several}\norder ::= {any_order}'}
+    if constraint == "structured_outputs":
+        one = f"({'|'.join(map(re.escape, orders))})"
+        return {"structured_outputs": {"regex": f"({NOTHING}|{one}({SEPARATOR}{one}){{0,{MOST_ORDERS - 1}}})"}}
+    if constraint == "json_schema":
+        schema = {
+            "type": "object",
+            "properties": {"orders": {"type": "array", "items": {"type": "string", "enum": list(orders)}}},
+            "required": ["orders"],
+            "additionalProperties": False,
+        }
+        return {
+            "response_format": {
+                "type": "json_schema",
+                "json_schema": {"name": "orders", "strict": True, "schema": schema},
+            }
+        }
+    return {}
 
 
 def similar_examples(note: str, count: int = _EXAMPLES_SHOWN) -> list[tuple[str, str]]:
@@ -94,12 +147,18 @@ def number_of(token: str) -> int | None:
     return int(token[:6]) if token.isdigit() else _NUMBER_WORDS.get(token)
 
 
-def parse_order(order: str) -> tuple[str, list[int]]:
+def _parsed(order: str) -> tuple[str, list[int]]:
     """The order's phrase and its numbers; raises ``BadOrders`` for other text."""
     for words, pattern in _PATTERNS.items():
         if found := pattern.fullmatch(order):
             return words, [int(number) for number in found.groups()]
     raise BadOrders(f"{order[:80]!r} is no order")
+
+
+def _filled(words: str, numbers: Sequence[int]) -> str:
+    for number in numbers:
+        words = words.replace("#", str(number), 1)
+    return words
 
 
 def _orders_in(text: str) -> list[str]:

@@ -36,8 +36,7 @@ from service.mission.resolved_spec import ResolvedSpec
 from service.mission.sensor_readings import PlacedReading, Readings
 from service.mission.visit_orders import VisitOrders
 from service.prompting.experiences import Experience, Experiences
-from shared.belief.fleet_belief import FleetBelief
-from shared.belief.gain_measurements import Measured
+from shared.belief.fleet_belief import FleetBelief, Measured
 from shared.belief.records import Records, take_report
 from shared.planning.guidance_messages import GuidanceAnswer
 from shared.planning.orders import Guidance
@@ -55,7 +54,7 @@ class Mission:
     """One fleet's state. Only the event loop uses it.
 
     Every change is an event, which ``record`` receives. The same events in the same order, on the same spec, make the
-    same mission again (see :mod:`service.storage.recovery`).
+    same mission again (see :mod:`service.edge.stored_missions`).
 
     Attributes:
         requested_spec: the spec of the request; ``spec`` is the resolved one.
@@ -89,10 +88,8 @@ class Mission:
         self.top_k = spec.top_k
         self.uses_attention = spec.uses_attention
         weights = initial_weights(spec.init, self.features, self.scenario.max_velocity + 1, spec.seed)
-        self.template = template_for(spec, self.scenario, weights)
-        self.prompt_fit = PromptFit(
-            spec, self.scenario, self.template.demonstrations, settings.llm_context, settings.adapted
-        )
+        self.template = template_for(spec, self.scenario)
+        self.prompt_fit = PromptFit(spec, self.scenario, settings.llm_context, settings.adapted)
         self.prompt_fits = not spec.uses_llm or self.prompt_fit.fits()
         if spec.uses_llm and not restored:
             self.prompt_fit.check()

@@ -4,11 +4,9 @@ from dataclasses import dataclass
 
 from service.config.settings import prompt_tokens
 from service.errors import Refused
-from service.learning.modules import Weights
 from service.llm.adapter_version import TRAINED_ROWS
 from service.mission.resolved_spec import ResolvedSpec
 from service.prompting.compact_prompt import CompactTemplate
-from service.prompting.demonstrations import solved
 from service.prompting.experiences import NEAREST
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.paper_prompt import Template
@@ -16,12 +14,8 @@ from service.prompting.prompt import note_block
 from shared.world.scenario import Scenario
 
 
-def template_for(spec: ResolvedSpec, scenario: Scenario, weights: Weights) -> Template:
-    """The template of the mission's mode.
-
-    Args:
-        weights: the attention weights that the mission begins with; they choose the rows of the demonstrations.
-    """
+def template_for(spec: ResolvedSpec, scenario: Scenario) -> Template:
+    """The template of the mission's mode."""
     experiences, note = spec.prompt.experiences, spec.note
     ranked = spec.uses_attention and spec.prompt.order == "score"
     rows = spec.top_k if spec.uses_attention else scenario.sensors
@@ -29,8 +23,7 @@ def template_for(spec: ResolvedSpec, scenario: Scenario, weights: Weights) -> Te
         return CompactTemplate(scenario, rows=rows)
     if spec.mode == "guided":
         return GuidedTemplate(scenario, rows=rows, experiences=experiences, ranked=ranked, note=note)
-    examples = solved(spec, spec.features, scenario, weights, spec.top_k if spec.uses_attention else None)
-    return Template(scenario, spec.features, demonstrations=examples, experiences=experiences, ranked=ranked, note=note)
+    return Template(scenario, spec.features, experiences=experiences, ranked=ranked, note=note)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,14 +31,12 @@ class PromptFit:
     """The size of a mission's prompts against the LLM's context.
 
     Attributes:
-        demonstrations: the text of the template's worked examples.
         context: tokens of the LLM's context.
         adapted: whether the LLM has the adapter that the compact prompt needs.
     """
 
     spec: ResolvedSpec
     scenario: Scenario
-    demonstrations: str
     context: int
     adapted: bool
 
@@ -63,18 +54,12 @@ class PromptFit:
                 "compact needs an LLM with an adapter: leave AICVDS_LLM_ADAPTER unset for the embedded LLM's, "
                 "or set it to `served` where your LLM server applies it",
             )
-        if self._compact and style.demonstrations:
-            raise Refused("prompt.demonstrations", "the compact prompt has no demonstrations: set them to 0")
         if self.fits():
             return
-        shown, lower = f"{style.experiences} experiences", "prompt.experiences"
-        if style.demonstrations:
-            shown += f", {style.demonstrations} demonstrations"
-            lower += ", prompt.demonstrations"
         raise Refused(
             "prompt",
-            f"{shown} and {self._rows} sensors as {style.format} need up to {self._needed()} tokens "
-            f"and AICVDS_LLM_CONTEXT is {self.context}: raise it, or lower {lower} or top_k",
+            f"{style.experiences} experiences and {self._rows} sensors as {style.format} need up to {self._needed()} "
+            f"tokens and AICVDS_LLM_CONTEXT is {self.context}: raise it, or lower prompt.experiences or top_k",
         )
 
     def warning(self) -> str | None:
@@ -90,7 +75,7 @@ class PromptFit:
         """The most tokens that a prompt can have."""
         style = self.spec.prompt
         lines = style.experiences + (NEAREST if style.selection == "similar" else 0)
-        needed = prompt_tokens(style.format, self._rows * uavs, lines, self.spec.features, self.demonstrations)
+        needed = prompt_tokens(style.format, self._rows * uavs, lines, self.spec.features)
         # A tokenizer makes at most one token of each byte. The compact prompt has no text of the note.
         return needed + (0 if self._compact else len(note_block(self.spec.note).encode()))
 

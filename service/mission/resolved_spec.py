@@ -32,8 +32,7 @@ class ResolvedSpec(MissionSpec):
         """The spec, completed by the service's settings and the defaults of its mode."""
         mode = spec.mode or settings.mode
         adapted = settings.adapted and mode in LLM_MODES
-        # The compact prompt has no demonstrations.
-        row_format = spec.prompt.format or ("compact" if adapted and not spec.prompt.demonstrations else "csv")
+        row_format = spec.prompt.format or ("compact" if adapted else "csv")
         compact = row_format == "compact"
         # Mode `llm` is the paper's method, unless the spec or the adapter differs.
         as_published = mode == "llm" and not compact

@@ -5,8 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from shared.planning.orders import Guidance, once
-from shared.planning.visit_deadlines import count_deadlines
+from shared.planning.orders import Guidance, count_deadlines, once
 from shared.wire.missions import VisitDeadline
 
 # Most ended orders in memory.

@@ -22,7 +22,7 @@ from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
-from shared.belief.gain_measurements import Measured
+from shared.belief.fleet_belief import Measured
 from shared.wire.readings import ReadingResult
 from shared.wire.schemas import DecideResponse
 

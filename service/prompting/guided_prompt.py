@@ -44,7 +44,7 @@ _CONTENT_FREE = ("N/A", "?,?,?")
 
 
 class GuidedTemplate(Template):
-    """The prompt of mode ``guided``; it has one format and no demonstrations.
+    """The prompt of mode ``guided``; it has one format.
 
     Attributes:
         labels: every choice letter of the mission's prompts.

@@ -5,7 +5,6 @@ What never changes comes first, for the LLM server's prefix cache: so the cost f
 
 from collections.abc import Sequence
 
-from service.prompting.demonstrations import Solved
 from service.prompting.prompt import Prompt, note_block
 from service.prompting.rows import (
     EXPERIENCE_NOTE,
@@ -55,12 +54,11 @@ Cost:
 The current task is the UAV's waypoint and a row for each of the {kept}, {order}:
 {introduction}
 
-{note}{experiences}{demonstrations}Output: exactly two whole numbers with a space between them, sensor_id velocity, \
+{note}{experiences}Output: exactly two whole numbers with a space between them, sensor_id velocity, \
 and nothing else: no explanation, no reasoning."""
 
 # The paper's highest velocity within 50 m of the chosen sensor, m/s.
 _NEAR_VELOCITY = 7
-_EXAMPLES = "Worked examples, each solved by a scheduler that looks ahead:"
 
 
 class Template:
@@ -71,7 +69,6 @@ class Template:
         features: the preset, which determines a row's columns.
         experiences: the most experiences of a prompt; with 0 the static block does not mention them.
         ranked: whether the rows are ordered best first.
-        demonstrations: worked examples for the static block.
         note: the operator's note.
     """
 
@@ -82,12 +79,9 @@ class Template:
         *,
         experiences: int = 30,
         ranked: bool = True,
-        demonstrations: Sequence[Solved] = (),
         note: str | None = None,
     ) -> None:
         self._columns = columns(features)
-        self.demonstrations = "".join(map(self._demonstration, demonstrations))
-        examples = f"{_EXAMPLES}\n\n{self.demonstrations}" if demonstrations else ""
         order = "the most promising first" if ranked else "in no particular order"
         self.static = _STATIC.format(
             last=scenario.sensors - 1,
@@ -103,7 +97,6 @@ class Template:
             introduction=introduction(features),
             note=note_block(note),
             experiences=f"{EXPERIENCE_NOTE}\n\n" if experiences else "",
-            demonstrations=examples,
         )
 
     def experience(self, seen: Cells, action: Action, cost: float, failed: bool) -> str:
@@ -132,9 +125,6 @@ class Template:
             state=last + "".join(map(row, cells(state, kept_rows))),
             uncompressed=UnprunedState(state, row, last),
         )
-
-    def _demonstration(self, solved: Solved) -> str:
-        return f"{''.join(map(row, solved.rows))}Answer: {solved.sensor_id} {solved.velocity}\n\n"
 
 
 def _levels(slowest: int, fastest: int) -> str:

@@ -14,64 +14,9 @@ from numpy.typing import NDArray
 
 from service.prompting.rows import ALWAYS_KNOWN, UNKNOWN, Cells, full_columns
 from shared.features.augmented_state import State
-from shared.kit.compiled import compiled
-from shared.world.channel import FloatArray, IntArray
 
-# The tokenizer makes a token of every three digits, from the left: a number below this is one token.
-_ONE_TOKEN_MORE = 1000
 # The placeholder for a number while the text around it is counted: one token, and not zero, which has no sign.
 _PLACEHOLDER = "5"
-
-
-@compiled
-def count_kinds(
-    columns: FloatArray,
-    needs_beacon: NDArray[np.bool_],
-    place_values: IntArray,
-    heard: NDArray[np.bool_],
-    most: int,
-    kinds: IntArray,
-    counts: IntArray,
-) -> tuple[int, int]:
-    """Count the kinds of J rows of C whole numbers, and the tokens of their digits.
-
-    A row's kind is a number to the base 3 with a digit for each column: 1 for a negative number, 2 for one unknown
-    without a beacon, 0 for any other.
-
-    Args:
-        columns: shape ``(C, J)``; rounded to whole numbers.
-        needs_beacon, place_values: shape ``(C,)``.
-        heard: shape ``(J,)``.
-        most: a token has fewer digits than this power of 10.
-        kinds, counts: shape ``(J,)``, are written: the kinds found, and the number of rows of each.
-
-    Returns:
-        the number of kinds, and the tokens of all known digits.
-    """
-    found, tokens = 0, 0
-    for row in range(columns.shape[1]):
-        kind = 0
-        for column in range(columns.shape[0]):
-            if needs_beacon[column] and not heard[row]:
-                kind += 2 * place_values[column]
-                continue
-            number = int(np.rint(columns[column, row]))
-            if number < 0:
-                kind += place_values[column]
-                number = -number
-            tokens += 1
-            while number >= most:
-                number //= most
-                tokens += 1
-        # There are a handful of kinds.
-        known = 0
-        while known < found and kinds[known] != kind:
-            known += 1
-        if known == found:
-            kinds[found], counts[found] = kind, 0
-            found += 1
-        counts[known] += 1
-    return found, tokens
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,16 +50,21 @@ class UnprunedState:
         """``count(text)``, for a tokenizer that splits digits and lines as o200k_base does."""
         columns = full_columns(self.state)
         names = tuple(columns)
-        numbers = np.array(list(columns.values()), dtype=np.float64)
-        kinds, counts = np.empty((2, numbers.shape[1]), dtype=np.int64)
-        # A copy, because numba would compile the function again for an array that is read-only.
-        heard = np.array(self.state.heard)
-        found, total = count_kinds(numbers, *_columns(names), heard, _ONE_TOKEN_MORE, kinds, counts)
+        numbers = np.rint(np.array(list(columns.values()))).astype(np.int64)
+        needs_beacon, place_values = _columns(names)
+        unknown = needs_beacon[:, None] & ~self.state.heard
+        kinds, counts = np.unique(place_values @ np.where(unknown, 2, numbers < 0), return_counts=True)
+        total = int(_digit_tokens(np.abs(numbers))[~unknown].sum())
         total += count(self.head) if self.head else 0
-        for kind, often in zip(kinds[:found].tolist(), counts[:found].tolist(), strict=True):
+        for kind, often in zip(kinds.tolist(), counts.tolist(), strict=True):
             text, known = _example_row(self.write, names, kind)
             total += often * (count(text) - known)
         return total
+
+
+def _digit_tokens(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The tokens of whole numbers from 0 on: the tokenizer makes one of every three digits."""
+    return 1 + np.floor(np.log10(np.maximum(numbers, 1))).astype(np.int64) // 3
 
 
 @lru_cache(maxsize=16)

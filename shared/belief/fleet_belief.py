@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from shared.belief.arrivals import Arrivals
 from shared.belief.drift import Drift
-from shared.belief.gain_measurements import NOTHING_MEASURED, Measured
 from shared.belief.learned_channel import ExpectedLinks, LearnedChannel
 from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Point, Scenario
@@ -23,6 +22,22 @@ FAR_M = 1e9
 _POSITION_ERROR_M = 0.01
 # The arrays of a belief.
 _ARRAYS = ("base", "since", "heard", "battery", "places", "visited")
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """The measurements of a report.
+
+    Attributes:
+        excess_db: shape ``(n,)``, excess losses of the sensors in radio range that were heard in this step, dB.
+        radio_failed: whether the UAV's last transmission failed over a good link.
+    """
+
+    excess_db: FloatArray
+    radio_failed: bool = False
+
+
+NOTHING_MEASURED = Measured(np.zeros(0))
 
 
 @dataclass(slots=True)

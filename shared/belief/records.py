@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.belief.fleet_belief import FleetBelief
-from shared.belief.gain_measurements import Measured
+from shared.belief.fleet_belief import FleetBelief, Measured
 from shared.wire.schemas import UavState
 from shared.wire.sensor_arrays import arrays_of
 from shared.world.channel import FloatArray

@@ -7,7 +7,7 @@ guidance. Empty guidance changes no number anywhere.
 from __future__ import annotations
 
 import operator
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Annotated, Self
 
 import numpy as np
@@ -321,6 +321,24 @@ def _in_words(kind: str, number: str = "", *, value: float) -> str:
         return f"Count each packet that sensor {number} loses {value:g} times"
     how = {"min_velocity": "slower than", "max_velocity": "faster than"}.get(kind, "at")
     return f"Never fly {how} {value:g} m/s"
+
+
+def count_deadlines(interval: int, since: int, last: int, visited: Iterable[int]) -> tuple[int, int]:
+    """The numbers of deadlines met and missed of one sensor from step ``since`` to step ``last``.
+
+    A deadline ends in every step whose last ``interval`` steps all lie in that time: the first in ``since + interval -
+    1``. It is met if one of these steps had a visit.
+
+    Args:
+        visited: the steps of the visits, in any order; others than those from ``since`` to ``last`` do not count.
+    """
+    first = since + interval - 1
+    met, through = 0, first - 1
+    for step in sorted(step for step in visited if since <= step <= last):
+        until = min(step + interval - 1, last)
+        met += max(0, until - max(step - 1, through))
+        through = max(through, until)
+    return met, max(0, last - first + 1) - met
 
 
 class Impossible(ValueError):

@@ -305,8 +305,7 @@ class PromptStyle(Received):
     """The form of the prompt.
 
     ``shuffled`` draws a new order of the rows for every step and UAV, from the mission's seed. Experiences are appended
-    until there are too many; ``selection`` then chooses the ones that stay. ``demonstrations`` are worked examples in
-    the static block.
+    until there are too many; ``selection`` then chooses the ones that stay.
     """
 
     format: PromptFormat | None = Field(
@@ -324,7 +323,8 @@ class PromptStyle(Received):
         "worst, or the newest of each sensor with failures first; default: the service's, and `failures` with the "
         "compact prompt",
     )
-    demonstrations: int = Field(0, ge=0, le=20, description="worked examples, solved by the teacher")
+    # Specs of stored missions name it.
+    demonstrations: int = Field(0, ge=0, le=0, deprecated=True, description="0: no prompt has worked examples any more")
 
 
 class MissionSpec(Received):

@@ -10,7 +10,7 @@ from tyro.conf import arg
 from simulator.bound.clairvoyant_bound import clairvoyant, confirmed
 from simulator.commands.options import WorldOptions, check_between, site_of
 from simulator.commands.running import command_main
-from simulator.records.record import Record
+from simulator.records.decision import Record
 from simulator.records.run_folder import naming_out
 
 

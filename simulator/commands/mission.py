@@ -68,7 +68,7 @@ def create(options: Create, console: Console) -> int:
     check_note(options.note)
     site = site_from_options(options.scenario, options.world, options.steps)
     from shared.client.edge_client import EdgeClient
-    from simulator.world.observation_report import decide_request
+    from simulator.world.observation import decide_request
 
     mission_id = options.mission or new_mission_id(site.scenario, options.seed)
     spec = site.named(MissionSpec(scenario=site.scenario, mode=options.mode, seed=options.seed, note=options.note))

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -48,21 +48,26 @@ class WorldOptions:
 
 def site_of(options: WorldOptions) -> Site:
     """The site that a command's options name, as :func:`site_from_options`."""
+    changes = changes_of(options.set, options.sensors, options.uavs)
+    check_seed(options.seed)
+    return site_from_options(options.scenario, options.world, options.steps, changes)
+
+
+def changes_of(given: Sequence[str], sensors: int | None, uavs: int | None) -> dict[str, Any]:
+    """A scenario's fields of ``--set FIELD=VALUE``, ``--sensors`` and ``--uavs``; raises ``UsageError``."""
     changes: dict[str, Any] = {}
-    for given in options.set:
-        field, equals, value = given.partition("=")
+    for one in given:
+        field, equals, value = one.partition("=")
         if not equals:
-            raise UsageError(f"--set {given[:64]}: write FIELD=VALUE, such as wind_mps=4")
+            raise UsageError(f"--set {one[:64]}: write FIELD=VALUE, such as wind_mps=4")
         if field not in Scenario.model_fields:
             near = suggestion(field, Scenario.model_fields)
-            raise UsageError(f"--set {given[:64]}: a scenario has no field {field[:32]!r}{near}")
+            raise UsageError(f"--set {one[:64]}: a scenario has no field {field[:32]!r}{near}")
         try:
             changes[field] = json.loads(value)
         except (ValueError, RecursionError):
             changes[field] = value
-    changes |= {name: n for name in ("sensors", "uavs") if (n := getattr(options, name)) is not None}
-    check_seed(options.seed)
-    return site_from_options(options.scenario, options.world, options.steps, changes)
+    return changes | {name: n for name, n in (("sensors", sensors), ("uavs", uavs)) if n is not None}
 
 
 def check_between(option: str, value: float, least: float, most: float) -> None:

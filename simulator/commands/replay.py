@@ -79,8 +79,6 @@ class Replay:
     """Experiences in the prompt, 0 to 100."""
     selection: Annotated[Selection | None, arg(metavar="recent|similar|best|failures", help_behavior_hint="")] = None
     """The selection of experiences beyond that number."""
-    demonstrations: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Worked examples in the prompt, 0 to 20."""
     deadline_ms: Annotated[int | None, arg(metavar="MS", help_behavior_hint="")] = None
     """Milliseconds that the edge may take for one decision, 10 to 60000. Default: as in each request."""
     wait_s: Annotated[float, arg(metavar="S")] = 120.0
@@ -92,7 +90,7 @@ class Replay:
 
 
 _OF_SPEC = ("mode", "top_k", "attention", "features", "init")
-_OF_PROMPT = ("order", "experiences", "selection", "demonstrations")
+_OF_PROMPT = ("order", "experiences", "selection")
 
 
 def main(argv: list[str]) -> int:

@@ -12,8 +12,7 @@ from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mod
 from shared.world.scenario import Scenario
 from simulator.policies.registry import LearningPolicy, Policy, policy_named
 from simulator.records.decision import DecidedBy
-from simulator.world.observation import Observation
-from simulator.world.observation_report import decide_request
+from simulator.world.observation import Observation, decide_request
 
 FALLBACK = "longest_queue"
 

@@ -1,12 +1,22 @@
-"""One decision of a flight: one line of ``decisions.jsonl``."""
+"""The base of every record that a run leaves on disk, and one decision of a flight: a line of ``decisions.jsonl``."""
 
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
 
 from shared.wire.reasons import LLM_FAILURES
 from shared.wire.schemas import Candidate, Tokens
-from simulator.records.record import Record
 
 DecidedBy = Literal["llm", "guided", "value", "policy", "onboard"]
+
+
+class Record(BaseModel):
+    """A record in a file; files of older versions may lack fields, and those of newer versions may have more."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
 
 
 class Decision(Record):
@@ -49,3 +59,25 @@ def queried_llm(decision: Decision) -> bool:
     if decision.source in ("llm", "guided") or decision.reason in LLM_FAILURES:
         return True
     return decision.tokens is not None and decision.tokens.server_prompt is not None
+
+
+def visits_per_sensor(decisions: Iterable[Decision], sensors: int) -> list[int]:
+    """The number of successful visits of each of ``sensors`` sensors."""
+    served = Counter(d.sensor_id for d in decisions if not d.failed)
+    return [served[j] for j in range(sensors)]
+
+
+def jain_index(values: Sequence[float]) -> float | None:
+    """Jain's fairness index, from 1/n (one value has all) to 1 (all equal); ``None`` if every value is 0."""
+    squares = sum(v * v for v in values)
+    return sum(values) ** 2 / (len(values) * squares) if squares else None
+
+
+def mean(values: Sequence[float]) -> float | None:
+    """The mean; ``None`` for an empty sequence."""
+    return sum(values) / len(values) if values else None
+
+
+def percentile(values: list[float], q: float) -> float | None:
+    """The ``q``-th percentile; ``None`` for an empty list."""
+    return float(np.percentile(values, q)) if values else None

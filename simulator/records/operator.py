@@ -3,10 +3,9 @@
 from collections.abc import Iterable, Sequence
 
 from shared.planning.guidance_messages import OrderRecord
-from shared.planning.visit_deadlines import count_deadlines
+from shared.planning.orders import count_deadlines
 from shared.wire.missions import VisitDeadline
-from simulator.records.decision import Decision
-from simulator.records.record import Record
+from simulator.records.decision import Decision, Record
 
 
 class OperatorRecord(Record):

@@ -5,9 +5,7 @@ from types import MappingProxyType
 
 from pydantic import Field
 
-from simulator.records.decision import Decision
-from simulator.records.record import Record
-from simulator.records.statistics import percentile
+from simulator.records.decision import Decision, Record, percentile
 
 # The ways decided and flown may differ by this share before the report warns.
 _TOLERANCE = 0.05

@@ -9,11 +9,9 @@ from pydantic import Field
 
 from shared.wire.names import Names
 from shared.wire.schemas import Tokens, Uplink
-from simulator.records.decision import Decision, queried_llm
+from simulator.records.decision import Decision, Record, jain_index, mean, percentile, queried_llm, visits_per_sensor
 from simulator.records.operator import OperatorRecord
 from simulator.records.real_uavs import RealUavs
-from simulator.records.record import Record
-from simulator.records.statistics import jain_index, mean, percentile, visits_per_sensor
 
 LATE_SLACK_MS = 50.0
 

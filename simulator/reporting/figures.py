@@ -18,8 +18,7 @@ from matplotlib.ticker import MaxNLocator
 
 from shared.world.scenario import Scenario
 from shared.world.trajectory import trajectories
-from simulator.records.decision import Decision
-from simulator.records.statistics import visits_per_sensor
+from simulator.records.decision import Decision, visits_per_sensor
 from simulator.records.summary import Tally
 from simulator.reporting.figure_style import PaperFigure, paper_figure
 

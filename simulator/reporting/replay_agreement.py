@@ -8,9 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from shared.wire.schemas import MissionSpec
-from simulator.records.decision import Decision, queried_llm
-from simulator.records.record import Record
-from simulator.records.statistics import mean
+from simulator.records.decision import Decision, Record, mean, queried_llm
 from simulator.records.summary import BySource, RoundTrips, round_trips, sources_text
 
 # The largest difference of velocities that agree, m/s.

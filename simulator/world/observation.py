@@ -1,4 +1,4 @@
-"""A UAV's observation of the world, and the result of a step of the fleet."""
+"""A UAV's observation of the world, its request to the edge, and the result of a step of the fleet."""
 
 from dataclasses import dataclass
 from typing import Literal, TypedDict
@@ -6,6 +6,7 @@ from typing import Literal, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.wire.schemas import DecideRequest, Outcome, SensorColumns
 from shared.world.channel import FloatArray, IntArray
 
 Cost = Literal["default", "paper"]
@@ -51,3 +52,42 @@ class StepTally:
     def events(self) -> int:
         """The paper's loss P_l of the step: failed transmissions plus overflowing sensors."""
         return self.failures + self.overflows
+
+
+def decide_request(
+    uav: int,
+    observation: Observation,
+    mission_id: str,
+    *,
+    deadline_ms: int | None = None,
+    outcome: Outcome | None = None,
+) -> DecideRequest:
+    """One UAV's request: its observation as columns, ``null`` for sensors that it never heard.
+
+    Raises:
+        pydantic.ValidationError: the observation breaks a bound of the wire.
+    """
+    heard = observation["last_heard"].tolist()
+    positions = observation["sensor_position"]
+
+    def column(values: FloatArray) -> list[float | None]:
+        return [value if step >= 0 else None for value, step in zip(values.tolist(), heard, strict=True)]
+
+    return DecideRequest(
+        mission_id=mission_id,
+        uav_id=uav,
+        step=int(observation["step"][0]),
+        position=observation["position"].tolist(),
+        progress_m=float(observation["progress"][0]),
+        sensors=SensorColumns(
+            id=list(range(len(heard))),
+            x=positions[:, 0].tolist(),
+            y=positions[:, 1].tolist(),
+            queue=column(observation["queue"]),
+            battery=column(observation["battery"]),
+            channel_gain=column(observation["channel_gain"]),
+            last_seen=[step if step >= 0 else None for step in heard],
+        ),
+        outcome=outcome,
+        deadline_ms=deadline_ms,
+    )

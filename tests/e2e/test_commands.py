@@ -74,7 +74,6 @@ PARSED = {
     "python -m lab distill": "an hour; tests/lab/distilling/test_distill.py runs it small",
     "python -m lab distill-orders": "an hour; tests/lab/distilling/test_distill_orders.py runs it small",
     "python -m lab pretrain": "minutes; tests/lab/commands/test_pretrain.py runs it small",
-    "python -m lab demonstrate": "minutes; tests/lab/commands/test_pretrain.py runs it small",
     "python -m benchmarks.": "minutes to hours, and they measure; tests/benchmarks runs them small",
     "python -m lab.benchmarks.": "minutes to hours, and they measure; tests/lab/benchmarks runs them small",
 }

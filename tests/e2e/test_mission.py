@@ -17,7 +17,7 @@ def test_a_mission_flown_by_the_llm_and_asked_again(tmp_path: Path) -> None:
         flown = run(
             "simulate", "--edge", url, "--steps", "4", "--seed", "2", "--no-bound", "--out", str(tmp_path / "out")
         )
-        options = ("--top-k", "3", "--demonstrations", "2", "--selection", "similar", "--out", str(tmp_path / "again"))
+        options = ("--top-k", "3", "--experiences", "4", "--selection", "similar", "--out", str(tmp_path / "again"))
         again = run("replay", str(tmp_path / "out"), "--edge", url, *options)
     assert flown.returncode == 0, flown.stderr
     assert again.returncode == 0, again.stderr
@@ -37,7 +37,7 @@ def test_a_mission_flown_by_the_llm_and_asked_again(tmp_path: Path) -> None:
 
     replay = json.loads((tmp_path / "again" / "replay.json").read_text())
     assert (replay["decisions"], replay["unasked"]) == (12, 0)
-    assert set(replay["changed"]) == {"top_k", "prompt.demonstrations", "prompt.selection"}
+    assert set(replay["changed"]) == {"top_k", "prompt.experiences", "prompt.selection"}
     # Other answers may be out of reach.
     assert replay["replayed"]["by_source"]["llm"] > 6
     assert replay["replayed"]["llm_new_tokens"] < 0.5 * replay["replayed"]["llm_prompt_tokens"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +32,13 @@ def mission_in(plan: Path) -> list[Item]:
     return made
 
 
-def pipeline_folder(folder: Path, seed: int, corners: int = 36, toml: str | None = None) -> Path:
-    """Scenario ``pipeline`` as a world's folder: its sensors for a seed, and its laps as polygons."""
+def pipeline_folder(
+    folder: Path, seed: int, corners: int = 36, toml: str | None = None, ahead_m: Sequence[float] = (0.0, 0.0, 0.0)
+) -> Path:
+    """Scenario ``pipeline`` as a world's folder: its sensors for a seed, and its laps as polygons.
+
+    A lap's polygon begins ``ahead_m`` metres after the trajectory's start, so that the UAVs start as far ahead.
+    """
     scenario = scenario_named("pipeline")
     frame = Frame(41.3, 39.9, (scenario.area_m / 2, scenario.area_m / 2))
     sensors = draw_positions(scenario, Streams.of(np.random.SeedSequence(seed)).layout)
@@ -40,8 +46,9 @@ def pipeline_folder(folder: Path, seed: int, corners: int = 36, toml: str | None
         feature("sensor", "Point", place, id=f"s{number}")
         for number, place in enumerate(frame.degrees(sensors).tolist())
     ]
-    for lap in trajectories(scenario):
-        ring = frame.degrees(lap.at(np.linspace(0.0, lap.length_m, corners, endpoint=False))).tolist()
+    for lap, ahead in zip(trajectories(scenario), ahead_m, strict=True):
+        places_m = (np.linspace(0.0, lap.length_m, corners, endpoint=False) + ahead) % lap.length_m
+        ring = frame.degrees(lap.at(places_m)).tolist()
         features.append(feature("trajectory", "Polygon", [[*ring, ring[0]]]))
     around = frame.degrees([(-100.0, -100.0), (1100.0, -100.0), (1100.0, 1100.0), (-100.0, 1100.0)]).tolist()
     features.append(feature("fence", "Polygon", [[*around, around[0]]]))

@@ -15,12 +15,11 @@ from shared.world.scenario import Point, Scenario
 from shared.world.trajectory import trajectories
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence
-from simulator.sites.files.names_and_map import names_and_map
+from simulator.sites.files.names_and_map import chained, names_and_map, simplified
 from simulator.sites.files.overrides import read_overrides
 from simulator.sites.files.reading import quoted
 from simulator.sites.files.recordings import read_gains, read_trace
 from simulator.sites.files.survey import MAX_WAYPOINTS, Survey, check_complete, read_survey
-from simulator.sites.pictured_line import chained, simplified
 from simulator.sites.projection import Frame, centre_of, fit_square
 from simulator.sites.site import Site
 

@@ -12,7 +12,7 @@ from playwright.sync_api import Page, expect
 from shared.wire.names import MapShape, Names
 from shared.wire.schemas import MissionSpec
 from simulator.sites.files.world_folder import site_from_folder
-from simulator.world.observation_report import decide_request
+from simulator.world.observation import decide_request
 from tests.e2e.page.conftest import Open, violations
 from tests.support.waiting import PATIENCE_S
 from tests.support.world_folders import EXAMPLE

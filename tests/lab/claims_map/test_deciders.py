@@ -14,7 +14,7 @@ from lab.claims_map.deciders import EdgeDecider, EdgeFleet, look_ahead_among
 from service.deciding.attended_state import AttendedState
 from shared.world.scenario import SCENARIOS
 from simulator.world.environment import PipelineWorld
-from simulator.world.observation_report import decide_request
+from simulator.world.observation import decide_request
 
 SHORT = SCENARIOS["paper"].model_copy(update={"steps": 12, "initial_queue_min": 0.9})
 REPORTED: dict[str, Any] = {"features": "paper", "belief": "reported", "init": "random"}

@@ -12,6 +12,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from lab.commands.experiment import ExperimentOptions, setup_of
 from lab.experiments.catalogue import EXPERIMENTS
 from lab.experiments.result import Result
 from lab.experiments.stand_ins import answering, drawn
@@ -45,6 +46,13 @@ def edge_of(process: subprocess.Popen[bytes]) -> int:
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     [edge] = [int(child) for child in children if b"serve" in Path(f"/proc/{child}/cmdline").read_bytes()]
     return edge
+
+
+def test_changes_of_a_scenario_are_flown_instead_of_the_experiments_own_worlds() -> None:
+    options = ExperimentOptions(name="scenarios", scenario="stress", uavs=2, set=("link_share=0.5",))
+    [scenario] = [site.scenario for site in setup_of(options).sites.values()]
+    assert (scenario.name, scenario.uavs, scenario.link_share) == ("stress_changed", 2, 0.5)
+    assert list(setup_of(ExperimentOptions(name="scenarios", sensors=20)).sites) == ["paper_changed"]
 
 
 def test_help_tells_what_every_experiment_is() -> None:

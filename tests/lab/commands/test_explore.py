@@ -47,6 +47,16 @@ def test_a_second_file_goes_on_with_further_worlds(tmp_path: Path, monkeypatch: 
     assert found["second"] == found["both"][36:]
 
 
+def test_a_scenario_is_changed_by_its_fields(tmp_path: Path) -> None:
+    out = tmp_path / "changed.gz"
+    changes = ["--sensors", "4", "--uavs", "2", "--set", "steps=3", "--set", "wind_mps=2"]
+    assert main(["--out", str(out), "--missions", "0", "--untaught", "1", *changes]) == 0
+    header, steps = read_rollouts(out)
+    scenario = header.scenario
+    assert (scenario.sensors, scenario.uavs, scenario.steps, scenario.wind_mps) == (4, 2, 3, 2.0)
+    assert scenario.name == "paper_changed" and len(list(steps)) == 3 * 2
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -56,6 +66,7 @@ def test_a_second_file_goes_on_with_further_worlds(tmp_path: Path, monkeypatch: 
         (["--workers", "0"], "--workers 0 is not between 1 and 64"),
         (["--scenario", "moon"], "unknown scenario 'moon'"),
         (["--edge", "http://127.0.0.1:1"], "no edge is ready at http://127.0.0.1:1"),
+        (["--set", "winds=4"], "--set winds=4: a scenario has no field 'winds'"),
         (["--edge", "127.0.0.1"], "'127.0.0.1' is not an edge's URL"),
     ],
 )

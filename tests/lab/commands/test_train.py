@@ -15,4 +15,4 @@ def test_without_torch_training_names_the_extra(tmp_path: Path) -> None:
     from lab.commands.train import Train, train
 
     with pytest.raises(UsageError, match=r"torch is not installed. Install the extra: pip install -e '.\[lab\]'"):
-        train(Train("madqn", out=tmp_path), "python -m lab train madqn", Console())
+        train(Train(scheme="madqn", out=tmp_path), "python -m lab train madqn", Console())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lab.experiments.jain import expected_by_chance, of_proportional_visits, reached_by_chance
-from simulator.records.statistics import jain_index
+from simulator.records.decision import jain_index
 
 RNG = np.random.default_rng(7)
 

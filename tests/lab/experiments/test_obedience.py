@@ -15,8 +15,7 @@ from lab.experiments.obedience import EXPERIMENT
 from lab.experiments.operators import Intent, Operator
 from lab.experiments.plan import plan
 from lab.experiments.schemes import OFF, over_edge
-from service.guidance.note_orders import EXAMPLES
-from service.guidance.order_grammar import admissible
+from service.guidance.note_orders import EXAMPLES, admissible
 from shared.client.edge_client import EdgeClient
 from shared.planning.orders import NO_GUIDANCE, Guidance, SensorWish
 from shared.wire.schemas import MissionSpec

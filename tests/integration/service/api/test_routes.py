@@ -301,7 +301,7 @@ def test_a_mission_says_how_it_shows_the_sensors(edge: Edge, report: Report) -> 
         {"experiences": -1},
         {"rows": 1},
         {"selection": "worst"},
-        {"demonstrations": 21},
+        {"demonstrations": 1},
     ):
         refused = client.put("/missions/wrong", json={"prompt": wrong})
         assert (refused.status_code, fields(refused)) == (422, [f"prompt.{next(iter(wrong))}"]), refused.text

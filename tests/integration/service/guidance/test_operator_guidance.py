@@ -18,8 +18,7 @@ from service.deciding.advisers import look_ahead
 from service.deciding.deliberation import Deliberation
 from service.deciding.rollout_evaluator import evaluate
 from service.deciding.rollout_state import RolloutState
-from service.guidance.note_orders import INSTRUCTION
-from service.guidance.order_grammar import constrain_orders
+from service.guidance.note_orders import INSTRUCTION, constrain_orders
 from service.guidance.step_guidance import StepGuidance
 from service.llm.answers import Completion
 from service.llm.client import LLMClient

@@ -14,7 +14,7 @@ from service.mission import planner
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.world.environment import PipelineWorld
-from simulator.world.observation_report import decide_request
+from simulator.world.observation import decide_request
 
 Edge = Callable[..., httpx.Client]
 SHORT = SCENARIOS["paper"].model_copy(update={"steps": 6})

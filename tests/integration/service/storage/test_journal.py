@@ -16,8 +16,8 @@ import pytest
 
 from service.api.mission_answers import status_of
 from service.config.settings import Settings
+from service.edge.stored_missions import restore_mission
 from service.storage import group_commit, journal
-from service.storage.recovery import restore_mission
 from service.storage.store import Store
 from tests.support.stored_missions import copy_of, fly, locked, on_disk, running, same, settled, state
 from tests.support.waiting import PATIENCE_S, until

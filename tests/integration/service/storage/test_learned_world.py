@@ -9,10 +9,10 @@ import pytest
 
 from service.api.mission_answers import status_of
 from service.config.settings import Settings
+from service.edge.stored_missions import restore_mission
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal
-from service.storage.recovery import restore_mission
 from service.storage.store import Store
 from shared.planning.guidance_messages import GuidanceAnswer
 from shared.planning.orders import Guidance, SensorWish

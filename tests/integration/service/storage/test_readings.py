@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from service.config.settings import Settings
+from service.edge.stored_missions import restore_mission
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal
-from service.storage.recovery import restore_mission
 from service.storage.rows import decode, pack
 from service.storage.store import Store
 from shared.wire.readings import SensorReading

@@ -16,13 +16,13 @@ import pytest
 
 from service.config.settings import Settings
 from service.edge import feedback
+from service.edge.stored_missions import restore_mission
 from service.errors import Refused, Unavailable
 from service.mission.idempotency import IdempotentAnswers
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal
 from service.storage.operations import Change, Checkpoint, Done, Entry, WriteFailed, Writer
-from service.storage.recovery import restore_mission
 from service.storage.rows import pack
 from service.storage.store import Store, StoredMission
 from shared.wire.schemas import MissionSpec, Outcome

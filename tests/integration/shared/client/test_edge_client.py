@@ -18,7 +18,7 @@ from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec
 from shared.world.scenario import SCENARIOS
 from simulator.flying.edge_session import LossyTransport
 from simulator.world.environment import PipelineWorld
-from simulator.world.observation_report import decide_request
+from simulator.world.observation import decide_request
 from tests.support.edge_stub import EdgeStub, stub_edge
 from tests.support.running import Handler, listening
 from tests.support.waiting import PATIENCE_S, Clock, Gate, soon, until

@@ -23,7 +23,7 @@ from shared.wire.missions import MissionAttention
 from shared.wire.schemas import Belief, Features, FeedbackRequest, MissionSpec, Outcome
 from shared.world.scenario import SCENARIOS
 from simulator.world.environment import PipelineWorld
-from simulator.world.observation_report import decide_request
+from simulator.world.observation import decide_request
 
 Edge = Callable[..., httpx.Client]
 PAPER = SCENARIOS["paper"]

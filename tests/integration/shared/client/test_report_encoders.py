@@ -14,7 +14,7 @@ from shared.client.report_encoders import DeltaReports
 from shared.wire.schemas import DecideRequest, MissionSpec
 from shared.world.scenario import SCENARIOS
 from simulator.world.environment import PipelineWorld
-from simulator.world.observation_report import decide_request
+from simulator.world.observation import decide_request
 from tests.integration.shared.client.test_edge_client import Awaited
 
 Edge = Callable[..., httpx.Client]

@@ -165,7 +165,7 @@ def test_a_request_without_a_flown_decision_is_not_replayed(run: Path) -> None:
         ([], "--edge is missing"),
         (["--edge", "nowhere"], "'nowhere' is not an edge's URL"),
         (["--edge", "http://e", "--top-k", "0"], "--top-k 0: "),
-        (["--edge", "http://e", "--demonstrations", "21"], "--demonstrations 21: "),
+        (["--edge", "http://e", "--experiences", "101"], "--experiences 101: "),
         (["--edge", "http://e", "--deadline-ms", "5"], "--deadline-ms 5"),
         (["--edge", "http://e", "--out", __file__], "is a file"),
     ],

@@ -12,7 +12,7 @@ from shared.planning.guidance_messages import GuidanceAnswer
 from shared.planning.orders import Guidance
 from shared.wire.schemas import MissionSpec, Mode
 from simulator.world.environment import PipelineWorld
-from simulator.world.observation_report import decide_request
+from simulator.world.observation import decide_request
 from tests.support.missions import PAPER, attended
 from tests.unit.service.prompting.test_compact_prompt import ADAPTED
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from service.edge.compilation import load_for_event_loop
-from service.prompting import unpruned_state
-from service.prompting.unpruned_state import UnprunedState
 from shared.belief import arrivals, link_expectations
 from shared.belief.fleet_belief import FleetBelief
 from shared.belief.records import take_report
@@ -23,7 +21,6 @@ def test_no_form_of_an_array_is_compiled_anew_once_the_edge_is_ready() -> None:
         link_expectations.transfer,
         link_expectations.know_rings,
         link_expectations.formula_transfers,
-        unpruned_state.count_kinds,
     ]
     load_for_event_loop()
     assert {function.__name__: len(function.signatures) for function in functions} == {  # type: ignore[attr-defined]
@@ -35,10 +32,9 @@ def test_no_form_of_an_array_is_compiled_anew_once_the_edge_is_ready() -> None:
     for step in range(60, 64):
         take_report(report(step), step, records, again)
         for known, rates in ((again, None), (None, records.rates)):
-            state = augment(
+            augment(
                 report(step), step, WORLD, visits=records.visits, rates=rates, reserved=(), preset="reach", belief=known
             )
-            UnprunedState(state, ",".join).tokens(len)
         again.record_decision(step % 2, step, 0, 3)
         again.settle(step % 2, step, failed=False)
     assert {len(function.signatures) for function in functions} == {1}  # type: ignore[attr-defined]

@@ -2,12 +2,18 @@
 
 import json
 import re
-from contextlib import suppress
 
 import pytest
 
-from service.guidance.note_orders import EXAMPLES, BadOrders, numbers_in, parse_orders, similar_examples
-from service.guidance.order_grammar import admissible, constrain_orders
+from service.guidance.note_orders import (
+    EXAMPLES,
+    BadOrders,
+    admissible,
+    constrain_orders,
+    numbers_in,
+    parse_orders,
+    similar_examples,
+)
 from shared.planning.orders import Guidance, Impossible, SensorWish
 
 NOTE = "Suspected leak at sensor 4: visit it every third step, not over 9 m/s."
@@ -72,40 +78,6 @@ def test_every_constraint_allows_the_right_orders_and_no_other_number() -> None:
     schema = constrain_orders("json_schema", NOTE)["response_format"]["json_schema"]["schema"]
     assert schema["properties"]["orders"]["items"]["enum"] == orders
     assert constrain_orders("none", NOTE) == {}
-
-
-def derived(grammar: str) -> set[str]:
-    """All that a grammar without recursion allows."""
-    rules = dict(line.split(" ::= ", 1) for line in grammar.splitlines())
-
-    def said(rule: str) -> set[str]:
-        found = set()
-        for words, _, following in re.findall(r'\(("[^)]*")\)( \(", " (s\d+)\)\?)?', rules[rule]):
-            for order in re.findall(r'"([^"]*)"', words):
-                found |= {order} | ({f"{order}, {rest}" for rest in said(following)} if following else set())
-        return found
-
-    return said("s0") | {"nothing"}
-
-
-def test_the_grammar_uses_no_number_more_often_than_the_note() -> None:
-    note = "Suspected leak at sensor 4: visit it every third step."
-    said = derived(constrain_orders("grammar", note)["grammar"])
-    assert "visit sensor 4 every 3 steps" in said and "fly at most 3 m/s, do not fly at 4 m/s" in said
-    assert "visit sensor 4 every 3 steps, sensor 4 counts 3 times" not in said
-    for text in said:
-        with suppress(BadOrders):
-            parse_orders(text, note)
-            continue
-        # Nothing is refused for its numbers.
-        assert re.search("fly at (most|least).*fly at", text), text
-    twice = derived(constrain_orders("grammar", "Sensor 3 every 3 steps, it counts 5 times.")["grammar"])
-    assert "visit sensor 3 every 3 steps, sensor 3 counts 5 times" in twice
-
-
-def test_a_note_with_many_numbers_gets_a_small_grammar() -> None:
-    grammar = constrain_orders("grammar", " ".join(map(str, range(10))))["grammar"]
-    assert grammar.count("::=") == 2
 
 
 def test_every_worked_example_stands_up_to_its_own_checks() -> None:

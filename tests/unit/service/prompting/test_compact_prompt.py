@@ -20,7 +20,7 @@ from shared.wire.schemas import MissionSpec
 from shared.world.actions import Action
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.world.environment import PipelineWorld
-from simulator.world.observation_report import decide_request
+from simulator.world.observation import decide_request
 from tests.support.missions import PAPER, attended
 
 ADAPTED = Settings(mode="llm", llm_url="http://127.0.0.1:9/v1", llm_adapter="served")
@@ -167,18 +167,6 @@ def test_more_sensors_than_the_adapter_was_trained_on_are_logged(
     caplog.clear()
     Mission("test", MissionSpec.model_validate(spec), ADAPTED, made.spec)
     assert not caplog.records
-
-
-def test_it_has_no_demonstrations() -> None:
-    spec = MissionSpec.model_validate({"mode": "llm", "prompt": {"format": "compact", "demonstrations": 2}})
-    with pytest.raises(Refused, match="set them to 0"):
-        Mission("test", spec, ADAPTED)
-
-
-@pytest.mark.parametrize(("field", "form"), [("experiences", "compact"), ("demonstrations", "csv")])
-def test_a_mission_that_asks_for_demonstrations_has_the_long_prompt(field: str, form: str) -> None:
-    spec = MissionSpec.model_validate({"mode": "llm", "prompt": {field: 2}})
-    assert Mission("test", spec, ADAPTED).spec.prompt.format == form
 
 
 def test_it_is_about_one_uav() -> None:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from shared.planning.visit_deadlines import count_deadlines
+from shared.planning.orders import count_deadlines
 
 
 def by_hand(every: int, since: int, last: int, visited: set[int]) -> tuple[int, int]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from simulator.records.decision import Decision
-from simulator.records.statistics import jain_index, visits_per_sensor
+from simulator.records.decision import Decision, jain_index, visits_per_sensor
 
 
 def decision(**changes: object) -> Decision:
