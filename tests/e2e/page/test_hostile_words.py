@@ -19,7 +19,7 @@ from simulator.commands import compare, simulate
 from tests.e2e.page.conftest import Open, Report
 from tests.support.running import serving
 from tests.support.stub_llm import PROBE, StubLlm, said, wait_for
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.needs("chromium")
 
@@ -32,6 +32,9 @@ LONG = "W" * 300
 MODEL = (SCRIPT + LONG)[:200]
 # A note is printable and has at most 280 characters.
 NOTES = (SCRIPT + ENDS, LONG[:280])
+# Notes of which an order is read, and which a report therefore has once they are confirmed.
+ORDER = "Visit sensor 4 every 3 steps."
+CONFIRMED = (f"{SCRIPT.replace('1', 'true')}. {ORDER}", f"{LONG[:240]}. {ORDER}")
 
 
 class Hostile(StubLlm):
@@ -91,13 +94,17 @@ def test_the_mission_page(visit: Open, report: Report, note: str, width: int) ->
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Folders with hostile names, of missions with hostile notes that a hostile model flew."""
+    """Folders with hostile names, of missions with confirmed hostile notes that a hostile model flew."""
     folders = []
-    for number, note in enumerate(NOTES):
+    for number, note in enumerate(CONFIRMED):
         name = ("<img src=x onerror=window.hacked=1>" if number else "W" * 200) + f"{{{{7*7}}}}&amp;{number}"
         folders.append(tmp_path_factory.mktemp("flown") / name)
         with hostile_edge() as edge:
-            options = ("--steps", "4", "--no-bound", "--note", note, "--mode", "llm", "--out", str(folders[-1]))
+            with httpx.Client(base_url=f"{edge}/missions", timeout=PATIENCE_S) as client:
+                client.put("/m", json={"note": note, "mode": "llm"}).raise_for_status()
+                until(lambda: client.get("/m/guidance").json()["status"] == "proposed")
+                client.post("/m/guidance", json={"answer": "confirm"}).raise_for_status()
+            options = ("--mission", "m", "--steps", "4", "--no-bound", "--out", str(folders[-1]))
             assert simulate.main(["--edge", edge, *options]) == 0
         summary = json.loads((folders[-1] / "summary.json").read_text(encoding="utf-8"))
         assert summary["model"] == MODEL
@@ -106,9 +113,10 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_the_report(visit: Open, flown: list[Path], width: int) -> None:
-    for folder in flown:
+    for folder, note in zip(flown, CONFIRMED, strict=True):
         page = visit((folder / "report.html").as_uri(), offline=True, viewport={"width": width, "height": 900})
         expect(page.locator("body")).to_contain_text("window.hacked=1")
+        expect(page.locator("body")).to_contain_text(note)
         harmless(page)
 
 
