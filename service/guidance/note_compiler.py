@@ -50,8 +50,8 @@ _READINGS = 3
 _SURE = 0.99
 _MOST_TOKENS = 96
 _LIKELIEST = 5
-_DIFFER = "The note can be read in more than one way."
-_UNLIKELY = "The LLM is not sure of this reading."
+_DIFFER = "“{note}” can be read in more than one way."
+_UNLIKELY = "The LLM is not sure of its reading of “{note}”."
 
 
 async def read_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReading:
@@ -70,7 +70,7 @@ async def read_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReadi
             raise BadOrders(str(error)) from None
         answer = await llm.rewrite(_request(lettered), temperature=0.0, seed=seed)
         found.append((_checked(answer.text, lettered, scenario), _probability(answer)))
-    return _most(found)
+    return _most(found, note)
 
 
 def _request(note: LetteredNote) -> Rewriting:
@@ -97,7 +97,7 @@ def _probability(answer: Completion) -> float:
     return math.prod(position.likeliest.get(position.token.strip(), 0.0) for position in answer.positions)
 
 
-def _most(found: Sequence[tuple[NoteReading | BadOrders | Impossible, float]]) -> NoteReading:
+def _most(found: Sequence[tuple[NoteReading | BadOrders | Impossible, float]], note: str) -> NoteReading:
     """The most frequent reading, the likelier of equal ones; raises the most frequent error."""
     texts = [str(one) if isinstance(one, Exception) else one.guidance.model_dump_json() for one, _ in found]
     often = Counter(texts)
@@ -107,9 +107,9 @@ def _most(found: Sequence[tuple[NoteReading | BadOrders | Impossible, float]]) -
         raise reading
     doubts = list(reading.doubts)
     if len(often) > 1:
-        doubts.append(_DIFFER)
+        doubts.append(_DIFFER.format(note=note))
     elif min(probability for _, probability in found) < _SURE:
-        doubts.append(_UNLIKELY)
+        doubts.append(_UNLIKELY.format(note=note))
     return NoteReading(reading.guidance, tuple(doubts), reading.numbers)
 
 
@@ -194,7 +194,8 @@ class NoteCompiler:
             log.exception("mission %s: the note was not compiled", mission.mission_id)
             reason = f"{type(error).__name__}: see the log"
         if _waits_for(mission, note):
-            mission.fail_guidance(f"{reason}; give `guidance` of your own", self._llm.notes_model)
+            reason = " ".join((*unclear, f"{reason}; give `guidance` of your own"))
+            mission.fail_guidance(reason, self._llm.notes_model)
             self._on_change(mission.mission_id)
 
     async def _wait_for_llm(self) -> None:

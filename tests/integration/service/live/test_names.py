@@ -61,6 +61,14 @@ def test_a_note_with_names_is_read_as_ids_and_shown_with_both(edge: Edge) -> Non
         assert "kp-" not in client.get("/metrics").text
 
 
+def test_a_note_that_is_not_understood_says_which_name_it_does_not_know(edge: Edge) -> None:
+    with serving(Scribe("gibberish").app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        client.put("/missions/test", json=SPEC | {"note": "Somebody heard kp-1.5 hum, keep 3 eyes on it."})
+        assert guidance(client, "failed")["failure"].startswith("“kp-1.5” is no name of this mission. ")
+
+
 def test_orders_of_sensors_without_a_name_stay_as_they_are() -> None:
     words = Guidance(sensors=[SensorWish(sensor_id=3, visit_every=2), SensorWish(sensor_id=99, weight=2.0)]).in_words()
     assert with_names(words, SITE.names) == words.replace("sensor 3", "sensor 3 (kp-1.58)")

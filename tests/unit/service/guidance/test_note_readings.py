@@ -60,11 +60,12 @@ async def test_three_readings_with_other_letters_that_agree_have_no_doubt() -> N
 async def test_where_the_readings_differ_the_commonest_is_proposed_with_a_doubt(answers: list[str]) -> None:
     found = await reading(Adapted(answers))
     assert found.guidance == MEANT
-    assert found.doubts == ("The note can be read in more than one way.",)
+    assert found.doubts == (f"“{NOTE}” can be read in more than one way.",)
 
 
 async def test_an_unlikely_reading_has_a_doubt() -> None:
-    assert (await reading(Adapted([RIGHT] * 3, probability=0.9))).doubts == ("The LLM is not sure of this reading.",)
+    found = await reading(Adapted([RIGHT] * 3, probability=0.9))
+    assert found.doubts == (f"The LLM is not sure of its reading of “{NOTE}”.",)
 
 
 async def test_a_part_that_the_llm_finds_unclear_is_quoted() -> None:
