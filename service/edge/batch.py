@@ -50,10 +50,10 @@ class BatchDecider:
             now, later = perf_counter(), len(uavs) - index - 1
             share_s = (deadline.at - now) / (later + 1)
             plan = plan or self._pipeline.begin_plan(mission, uavs[index:], step, Deadline(now + share_s - RESERVE_S))
-            deadline_ms = max(1, int((now - own.started + share_s) * 1e3))
-            mine = Deadline(own.started + deadline_ms / 1e3 - RESERVE_S)
+            mine = Deadline(now + share_s - RESERVE_S)
             # The evaluator may exceed its UAV's share, as long as enough time is left for the later UAVs.
             evaluation = max(mine, Deadline(deadline.at - RESERVE_S - self._pipeline.own_s * later))
+            deadline_ms = max(1, int((evaluation.at + RESERVE_S - own.started) * 1e3))
             task = DecisionTask(
                 mission,
                 uav,

@@ -98,6 +98,12 @@ def test_three_uavs_are_decided_by_one_call(edge: Edge, report: Report) -> None:
     assert 'aicvds_llm_requests_total{outcome="ok"} 1.0' in metrics
 
 
+def test_a_decisions_time_limit_includes_what_later_uavs_can_spare(edge: Edge, report: Report) -> None:
+    """The evaluator may use it: such a decision is not past its deadline, and the batch is in time."""
+    first, *_, last = decided(edge(mode="value"), batch(report, deadline_ms=6000))
+    assert 5000 < first["deadline_ms"] <= 6000 and 5000 < last["deadline_ms"] <= 6000
+
+
 def test_the_call_is_counted_once(edge: Edge, report: Report) -> None:
     with serving(Chorus().app) as url:
         client = edge(mode="guided", llm_url=f"{url}/v1")
