@@ -19,7 +19,7 @@ from shared.world.urgency import overflow_probability
 
 # Most missions watched, and most steps remembered of each.
 _MOST_MISSIONS = 1000
-_MOST_STEPS = 1000
+_MOST_STEPS = 300
 # Seconds without a decision after which a mission has ended early, and (with three steps) its UAVs are lost.
 _ENDED_S, _SILENT_S = 600.0, 30.0
 
