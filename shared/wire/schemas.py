@@ -5,7 +5,7 @@ surveyed position (``x``, ``y``), and ``null`` in the four columns that only a b
 """
 
 import operator
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
@@ -28,6 +28,9 @@ UavId = Annotated[int, Field(ge=0, le=99)]
 Step = Annotated[int, Field(ge=0, le=MAX_STEP)]
 SensorId = Annotated[int, Field(ge=0, lt=MAX_SENSORS)]
 Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
+Packets = Annotated[float, Field(ge=0, le=100_000)]
+Joules = Annotated[float, Field(ge=0, le=1e9)]
+Decibels = Annotated[float, Field(ge=-400, le=0)]
 Note = Annotated[str, Field(max_length=MAX_NOTE), AfterValidator(one_paragraph)]
 DeadlineMs = Annotated[int, Field(ge=10, le=60_000, description="answer within this many milliseconds")]
 
@@ -42,6 +45,13 @@ Source = Literal["llm", "guided", "value", "policy"]
 Uplink = Literal["full", "delta", "pruned"]
 
 
+def _column(description: str) -> Any:
+    return Field(max_length=MAX_SENSORS, fail_fast=True, description=description)
+
+
+Surveyed = Annotated[list[Metres], _column("m, surveyed; omitted: as sent before")]
+
+
 class SensorColumns(Received):
     """One UAV's knowledge of the sensors: parallel arrays of 1 to 2,000 entries, all of the same length.
 
@@ -50,36 +60,13 @@ class SensorColumns(Received):
     positions any UAV of the mission has sent. Only a report with a ``base`` may be empty.
     """
 
-    id: Annotated[list[SensorId], Field(max_length=MAX_SENSORS, fail_fast=True, description="no duplicates")]
-    x: list[Metres] = Field(
-        default_factory=list,
-        max_length=MAX_SENSORS,
-        fail_fast=True,
-        exclude_if=operator.not_,
-        description="m, surveyed; omitted: as sent before",
-    )
-    y: list[Metres] = Field(
-        default_factory=list,
-        max_length=MAX_SENSORS,
-        fail_fast=True,
-        exclude_if=operator.not_,
-        description="m, surveyed; omitted: as sent before",
-    )
-    queue: Annotated[
-        list[Annotated[float, Field(ge=0, le=100_000)] | None],
-        Field(max_length=MAX_SENSORS, fail_fast=True, description="packets waiting"),
-    ]
-    battery: Annotated[
-        list[Annotated[float, Field(ge=0, le=1e9)] | None],
-        Field(max_length=MAX_SENSORS, fail_fast=True, description="J left"),
-    ]
-    channel_gain: Annotated[
-        list[Annotated[float, Field(ge=-400, le=0)] | None],
-        Field(max_length=MAX_SENSORS, fail_fast=True, description="dB, minus the path loss"),
-    ]
-    last_seen: Annotated[
-        list[Step | None], Field(max_length=MAX_SENSORS, fail_fast=True, description="step of the last beacon")
-    ]
+    id: Annotated[list[SensorId], _column("no duplicates")]
+    x: Surveyed = Field(default_factory=list, exclude_if=operator.not_)
+    y: Surveyed = Field(default_factory=list, exclude_if=operator.not_)
+    queue: Annotated[list[Packets | None], _column("packets waiting")]
+    battery: Annotated[list[Joules | None], _column("J left")]
+    channel_gain: Annotated[list[Decibels | None], _column("dB, minus the path loss")]
+    last_seen: Annotated[list[Step | None], _column("step of the last beacon")]
 
     @model_validator(mode="after")
     def _rectangular(self) -> Self:
