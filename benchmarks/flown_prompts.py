@@ -21,8 +21,8 @@ from service.prompting.candidates import CandidateSet
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from shared.wire.schemas import MissionSpec, Outcome
-from shared.world.actions import Action
 from shared.world.scenario import Scenario
+from shared.world.step_rule import Action
 from simulator.flying.flight import fly
 from simulator.flying.pilots import LocalPilot, PilotChoice
 from simulator.sites.site import Site

@@ -30,8 +30,8 @@ from service.config.settings import Settings
 from service.deciding.rollout_evaluator import evaluate
 from service.llm.answers import NoDecision, check_answer
 from service.prompting.token_accounting import TokenCounter
-from shared.world.actions import Action
 from shared.world.scenario import Scenario, scenario_named
+from shared.world.step_rule import Action
 
 GOAL_PROMPT, GOAL_NEW = 0.5, 0.15
 # The forms with judged answers: an answer is a sensor and a velocity, or a letter for both.

@@ -38,7 +38,7 @@ from service.mission.mission import Mission
 from service.prompting.candidates import Viewpoint, velocity_options
 from service.prompting.compact_prompt import Outlook, fleet_digits, row_digits, sign
 from shared.wire.schemas import MissionSpec
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 
 ROWS, OPTIONS = 10, 6
 # Belief and experiences of a recording's missions, one after the other: most have a learned belief, as by default.

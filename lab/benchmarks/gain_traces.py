@@ -32,9 +32,9 @@ from lab.experiments.formula_planner import FormulaPlanner
 from lab.experiments.intervals import interval, paired
 from lab.experiments.schemes import OFF
 from shared.client.edge_client import EdgeClient
-from shared.world.actions import Action
 from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario, scenario_named
+from shared.world.step_rule import Action
 from shared.world.trajectory import trajectories
 from simulator.flying.flight import fly, rollout
 from simulator.flying.pilots import EdgePilot

@@ -31,7 +31,7 @@ from service.guidance.note_orders import BadOrders, number_of, parse_orders, sim
 from service.guidance.note_phrases import PhrasedNote
 from service.llm.answers import NoDecision
 from service.llm.server_pool import ServerPool
-from service.prompting.warm_up import warm_up
+from service.mission.prompt_fit import warm_up
 from shared.planning.orders import Guidance, Impossible
 from shared.world.scenario import SCENARIOS
 

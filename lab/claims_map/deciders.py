@@ -19,8 +19,8 @@ from service.learning.modules import Sample
 from service.mission.mission import Mission
 from shared.wire.schemas import DecideRequest, MissionSpec, Outcome
 from shared.wire.sensor_arrays import arrays_of
-from shared.world.actions import Action
 from shared.world.scenario import Scenario
+from shared.world.step_rule import Action
 from simulator.world.observation import Observation, decide_request
 
 

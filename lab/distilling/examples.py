@@ -25,8 +25,8 @@ from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet
 from service.prompting.compact_prompt import SIGNS, sign
 from shared.wire.schemas import Belief, MissionSpec
-from shared.world.actions import Action
 from shared.world.channel import FloatArray
+from shared.world.step_rule import Action
 
 # The teacher's own action has this share of a target; the rest goes by regret.
 _REFERENCE_SHARE = 0.6

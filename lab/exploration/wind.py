@@ -68,7 +68,7 @@ def course(world: PipelineWorld, sums: int) -> FloatArray:
     reached = [fleet.progress_m]
     for _ in range(sums - 1):
         middle = reached[-1] + step_s / 2
-        reached.append(reached[-1] + step_s * wind.stretch(middle, fleet.trajectories))
+        reached.append(reached[-1] + step_s * wind.stretch(wind.along_mps(middle, fleet.trajectories)))
     return np.array(reached)
 
 

@@ -8,7 +8,7 @@ from lab.exploration.rollouts import RolloutStep
 from service.deciding.attended_state import AttendedState
 from service.mission.mission import Mission
 from shared.wire.schemas import Outcome
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 
 
 def recorded_states(mission: Mission, steps: Iterable[RolloutStep]) -> Iterator[tuple[RolloutStep, AttendedState]]:

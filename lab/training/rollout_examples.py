@@ -21,8 +21,8 @@ from service.learning.modules import Sample
 from service.mission.mission import Mission
 from shared.features.augmented_state import Reach, State, distances_between, places_ahead
 from shared.wire.schemas import Belief, Features, MissionSpec
-from shared.world.actions import Action
 from shared.world.scenario import Scenario
+from shared.world.step_rule import Action
 
 
 @dataclass(frozen=True, slots=True)

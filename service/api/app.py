@@ -19,10 +19,10 @@ from service.config.settings import Settings
 from service.edge.compilation import load_for_event_loop
 from service.edge.engine import Engine
 from service.llm.server_pool import ServerPool
+from service.mission.prompt_fit import warm_up
 from service.observability.metrics import Metrics
 from service.observability.tracing import Traced, Traces, provider_from_environment
 from service.prompting.token_accounting import TokenCounter
-from service.prompting.warm_up import warm_up
 from service.server.middleware import SecurityHeaders
 from service.storage.store import Store
 

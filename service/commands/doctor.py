@@ -169,7 +169,7 @@ def llm_servers(settings: Settings) -> Iterator[Finding]:
 def _llm_server(settings: Settings) -> Iterator[Finding]:
     from service.llm.answers import NoDecision
     from service.llm.probing import examine
-    from service.prompting.warm_up import warm_up
+    from service.mission.prompt_fit import warm_up
 
     async def examined() -> Examination:
         async with asyncio.timeout(_EXAMINED_S):

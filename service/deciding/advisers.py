@@ -15,8 +15,8 @@ from service.deciding.attended_state import AttendedState
 from service.guidance.step_guidance import StepGuidance
 from service.learning.trust import PLANNER
 from shared.features.augmented_state import Reach, State
-from shared.world.actions import Action
 from shared.world.channel import FloatArray
+from shared.world.step_rule import Action
 
 # In units of the value regression's target, minus the cost.
 _VALUE_TEMPERATURE = 0.05

@@ -19,9 +19,9 @@ from service.prompting.rows import cells
 from shared.features.augmented_state import Reach, State, augment
 from shared.planning.orders import Guidance
 from shared.wire.schemas import Candidate, UavState
-from shared.world.actions import Action
 from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario
+from shared.world.step_rule import Action
 from shared.world.urgency import overflow_probability, urgency_of
 
 

@@ -10,7 +10,7 @@ from service.llm.answers import Completion
 from service.mission.mission import Mission
 from shared.wire.reasons import Reason
 from shared.wire.schemas import Guided, UavState
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 
 # The part of a deadline reserved for the check, the answer and the event loop.
 RESERVE_S = 0.02

@@ -35,8 +35,8 @@ from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from shared.wire.reasons import Reason
 from shared.wire.schemas import Guided, Weighed
-from shared.world.actions import Action
 from shared.world.channel import FloatArray
+from shared.world.step_rule import Action
 
 # Candidates that a response names.
 _REPORTED = 5

@@ -18,7 +18,7 @@ from service.observability.metrics import Metrics
 from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
 from shared.wire.reasons import Reason
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 
 log = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ from service.llm.answers import Completion, NoDecision
 from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
 from shared.wire.schemas import Mode as ModeName
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 
 log = logging.getLogger(__name__)
 

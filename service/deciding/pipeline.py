@@ -20,7 +20,7 @@ from service.prompting.prompt import Prompt
 from service.prompting.token_accounting import TokenCounter
 from shared.kit.cores import usable_cores
 from shared.wire.schemas import Tokens
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 
 # The initial estimate of a decision's own seconds, and the length of its average.
 _OWN_S, _OWN_MEMORY = 0.03, 20

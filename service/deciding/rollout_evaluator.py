@@ -22,9 +22,9 @@ from shared.belief.fleet_belief import FleetBelief
 from shared.kit.compiled import compiled, inlined
 from shared.planning.annealing_arrays import listed
 from shared.planning.orders import LATE_PACKETS
-from shared.world.actions import Action
 from shared.world.channel import FloatArray
 from shared.world.scenario import SCENARIOS
+from shared.world.step_rule import Action
 from shared.world.urgency import VELOCITY_BONUS, urgency
 
 # Sampled futures. All candidates are flown through the same ones, so that arrivals cause no difference between them. On

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from shared.belief.arrivals import Arrivals
 from shared.belief.fleet_belief import FleetBelief
 from shared.planning.orders import NO_GUIDANCE, Guidance
-from shared.world.actions import Action
 from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario
+from shared.world.step_rule import Action
 
 # Steps. Losses after the horizon do not count, because the positions where look-ahead leaves the UAVs are arbitrary.
 # The planner's horizon has four more steps without visits. With these the evaluator rated a planner's action 1.3

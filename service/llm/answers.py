@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from shared.wire.reasons import Reason
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 
 _TWO_INTEGERS = re.compile(r"([0-9]{1,5}) ([0-9]{1,2})")
 

@@ -43,9 +43,9 @@ from shared.planning.orders import Guidance
 from shared.wire.missions import VisitDeadline
 from shared.wire.readings import ReadingResult, SensorReading
 from shared.wire.schemas import Belief, Features, MissionSpec, Mode, Outcome, UavState
-from shared.world.actions import Action
 from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario, scenario_named
+from shared.world.step_rule import Action
 
 log = logging.getLogger(__name__)
 

@@ -1,17 +1,18 @@
-"""A mission's prompt template, and whether the LLM's context is large enough for its prompts."""
+"""A mission's prompt template, whether the LLM's context is large enough for its prompts, and the LLM's warm-up."""
 
 from dataclasses import dataclass
 
-from service.config.settings import prompt_tokens
+from service.config.settings import Settings, prompt_tokens
 from service.errors import Refused
 from service.llm.adapter_version import TRAINED_ROWS
+from service.llm.request_bodies import WarmUp
 from service.mission.resolved_spec import ResolvedSpec
 from service.prompting.compact_prompt import CompactTemplate
 from service.prompting.experiences import NEAREST
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.paper_prompt import Template
 from service.prompting.prompt import note_block
-from shared.world.scenario import Scenario
+from shared.world.scenario import SCENARIOS, Scenario
 
 
 def template_for(spec: ResolvedSpec, scenario: Scenario) -> Template:
@@ -86,3 +87,18 @@ class PromptFit:
     @property
     def _rows(self) -> int:
         return min(self.scenario.sensors, self.spec.top_k) if self.spec.uses_attention else self.scenario.sensors
+
+
+def warm_up(settings: Settings) -> WarmUp:
+    """The warm-up request with the static block of a mission of default settings; it fills the prefix cache."""
+    paper = SCENARIOS["paper"]
+    if settings.adapted:
+        compact = CompactTemplate(paper, rows=settings.top_k)
+        return WarmUp(compact.static, "999999U9a9999999A", compact.labels)
+    if settings.mode == "guided":
+        guided = GuidedTemplate(
+            paper, rows=settings.top_k, experiences=settings.most_experiences("guided"), ranked=True
+        )
+        return WarmUp(guided.static, guided.content_free()[0], guided.labels)
+    template = Template(paper, experiences=settings.most_experiences("llm"))
+    return WarmUp(template.static, "UAV at 500,500\n0,50,50,-90,100,1,60,40\n", None)

@@ -18,7 +18,7 @@ import numpy as np
 
 from shared.belief.fleet_belief import FleetBelief
 from shared.features.augmented_state import Reach, State
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 
 # OpenAI and vLLM return the probabilities of at most 20 tokens.
 _MOST_LABELS = 20

@@ -23,9 +23,9 @@ from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.rows import UNKNOWN, Cells
 from shared.belief.learned_channel import LIKELY, ExpectedLinks
 from shared.features.augmented_state import Reach, State
-from shared.world.actions import Action
 from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario
+from shared.world.step_rule import Action
 
 STATIC = "Collect packets. Answer with one letter."
 # A sensor's sign: the one at its ID, modulo their number. Between digits each is one token of the embedded model.

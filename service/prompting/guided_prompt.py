@@ -9,8 +9,8 @@ from service.prompting.prompt import Prompt, note_block
 from service.prompting.rows import Cells, cells, row
 from service.prompting.unpruned_state import UnprunedState
 from shared.features.augmented_state import Reach, State
-from shared.world.actions import Action
 from shared.world.scenario import Scenario
+from shared.world.step_rule import Action
 
 _STATIC = """You direct a fleet of UAVs that collect data packets from ground sensors along a pipeline. \
 At each waypoint you choose{each} one sensor to collect from and the velocity for the next {step_s:g} seconds.

@@ -19,8 +19,8 @@ from service.prompting.rows import (
 from service.prompting.unpruned_state import UnprunedState
 from shared.features.augmented_state import State
 from shared.wire.schemas import Features
-from shared.world.actions import Action
 from shared.world.scenario import Scenario
+from shared.world.step_rule import Action
 
 _STATIC = """You schedule data collection for a fleet of UAVs that fly over ground sensors along a pipeline.
 

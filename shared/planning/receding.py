@@ -18,9 +18,9 @@ from shared.planning.fleet_problem import FleetProblem, Found, with_fixed
 from shared.planning.greedy import look_ahead
 from shared.planning.orders import NO_GUIDANCE, Guidance
 from shared.planning.queue_chains import Arriving, QueueChains, queue_chains
-from shared.world.actions import Action
 from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario
+from shared.world.step_rule import Action
 
 _HORIZON = 8
 # After the horizon a sensor's losses count until the nearest UAV can be there, as if none visited it in the meantime:

@@ -19,7 +19,7 @@ The paper's packet loss P_l of the step, its Eq. (9), is the sum of all f and al
 
 import math
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,13 @@ from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario
 
 BoolArray = NDArray[np.bool_]
+
+
+class Action(NamedTuple):
+    """A sensor's ID and a velocity in m/s. An action equals the plain pair, and is stored and sent as a pair."""
+
+    sensor_id: int
+    velocity: int
 
 
 def transfer(

@@ -4,8 +4,8 @@ import numpy as np
 
 from shared.belief.fleet_belief import FleetBelief
 from shared.planning.receding import Draft, RecedingHorizon
-from shared.world.actions import Action
 from shared.world.scenario import Scenario
+from shared.world.step_rule import Action
 from simulator.policies.hand_written import longest_unheard
 from simulator.world.observation import Observation
 

@@ -222,13 +222,10 @@ class Wind:
         if not self.blows:
             return still
         along = self.along_mps(progress_m + still / 2, paths) + self.gust_mps(instant, len(paths))
-        return np.asarray(still * self._stretch(along))
+        return np.asarray(still * self.stretch(along))
 
-    def stretch(self, progress_m: FloatArray, paths: Sequence[Trajectory]) -> FloatArray:
-        """The metres flown in the mean wind per metre in still air at a progress ``(..., I)``, 0..2."""
-        return self._stretch(self.along_mps(progress_m, paths))
-
-    def _stretch(self, along_mps: FloatArray) -> FloatArray:
+    def stretch(self, along_mps: FloatArray) -> FloatArray:
+        """The metres flown in a wind along the way per metre in still air, 0..2."""
         return np.asarray(np.clip(1.0 + along_mps / self.scenario.max_velocity, 0.0, 2.0))
 
     def gust_mps(self, instant: int, uavs: int) -> FloatArray:

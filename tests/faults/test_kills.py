@@ -204,4 +204,5 @@ def test_a_start_with_a_long_journal(
         start_with_one_mission_s=f"{min(s for s, _ in short):.2f}",
         first_mission_read_back_s=f"{min(w for _, w in long):.2f}",
     )
-    assert min(s for s, _ in long) < 3.0
+    # In the same run, because machines differ: 400 times as many missions are no reason to start later.
+    assert min(s for s, _ in long) < 2 * min(s for s, _ in short)

@@ -14,8 +14,8 @@ from shared.belief.records import Records, take_readings
 from shared.client.edge_client import EdgeClient
 from shared.wire.readings import ReadingsRequest, ReadingsResponse
 from shared.wire.schemas import MissionSpec
-from shared.world.actions import Action
 from shared.world.scenario import scenario_named
+from shared.world.step_rule import Action
 from simulator.flying.flight import fly
 from simulator.flying.pilots import EdgePilot, LocalPilot
 from simulator.policies.mpc import RecedingHorizonPolicy

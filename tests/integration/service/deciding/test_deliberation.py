@@ -27,8 +27,8 @@ from service.prompting.prompt import Prompt
 from shared.belief.learned_channel import ExpectedLinks
 from shared.features.augmented_state import Reach
 from shared.wire.schemas import MissionSpec, Outcome
-from shared.world.actions import Action
 from shared.world.channel import channel_gain_db
+from shared.world.step_rule import Action
 from shared.world.trajectory import trajectories
 from tests.support.missions import PAPER, attended, uav
 from tests.support.running import listening, serving

@@ -13,7 +13,7 @@ from service.deciding.modes import verify
 from service.llm.answers import NoDecision
 from service.mission.mission import Mission
 from shared.wire.schemas import MissionSpec
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 from tests.support.missions import attended, mission, uav
 from tests.support.running import serving
 from tests.support.stub_llm import StubLlm, wait_for

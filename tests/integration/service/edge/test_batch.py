@@ -22,7 +22,7 @@ from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from service.prompting.rows import row
 from service.prompting.unpruned_state import UnprunedState
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 from tests.support.missions import PAPER, attended, mission, uav
 from tests.support.running import serving
 from tests.support.stub_llm import PROBE, StubLlm, said, wait_for

@@ -19,7 +19,7 @@ from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.journal import NullJournal
 from shared.wire.schemas import MissionSpec, Outcome
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 from tests.support.missions import attended, uav
 from tests.support.stored_missions import fly, running, same, settled, state
 

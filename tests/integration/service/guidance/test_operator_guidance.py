@@ -31,7 +31,7 @@ from service.prompting.paper_prompt import Template
 from shared.planning.guidance_messages import GuidanceAnswer
 from shared.planning.orders import Guidance, SensorWish
 from shared.wire.schemas import MissionSpec
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 from tests.integration.service.api.test_routes import fields
 from tests.support.missions import PAPER, attended, mission, uav
 from tests.support.running import serving

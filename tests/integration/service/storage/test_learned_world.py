@@ -17,8 +17,8 @@ from service.storage.store import Store
 from shared.planning.guidance_messages import GuidanceAnswer
 from shared.planning.orders import Guidance, SensorWish
 from shared.wire.schemas import MissionSpec, Outcome, SensorColumns, UavState
-from shared.world.actions import Action
 from shared.world.channel import channel_gain_db
+from shared.world.step_rule import Action
 from shared.world.trajectory import trajectories
 from tests.support.missions import PAPER, attended
 from tests.support.stored_missions import same, state

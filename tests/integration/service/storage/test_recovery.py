@@ -26,8 +26,8 @@ from service.storage.operations import Change, Checkpoint, Done, Entry, WriteFai
 from service.storage.rows import pack
 from service.storage.store import Store, StoredMission
 from shared.wire.schemas import MissionSpec, Outcome
-from shared.world.actions import Action
 from shared.world.scenario import Scenario
+from shared.world.step_rule import Action
 from tests.support.missions import attended, uav
 from tests.support.running import serving
 from tests.support.stored_missions import copy_of, fly, locked, running, same, settled, state, writers

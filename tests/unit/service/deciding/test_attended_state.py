@@ -2,8 +2,8 @@ import numpy as np
 
 from shared.features.augmented_state import FEATURES
 from shared.wire.schemas import MissionSpec
-from shared.world.actions import Action
 from shared.world.channel import channel_gain_db
+from shared.world.step_rule import Action
 from shared.world.urgency import urgency
 from tests.support.missions import PAPER, attended, mission, uav
 

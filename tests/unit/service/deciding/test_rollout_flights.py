@@ -12,8 +12,8 @@ from service.deciding import rollout_evaluator
 from service.deciding.rollout_evaluator import evaluate
 from service.deciding.rollout_state import RolloutState, SampledFutures
 from shared.planning.orders import LATE_PACKETS, Guidance, SensorWish
-from shared.world.actions import Action
 from shared.world.scenario import SCENARIOS
+from shared.world.step_rule import Action
 from shared.world.urgency import VELOCITY_BONUS, urgency
 
 WORLD = SCENARIOS["paper"].model_copy(update={"sensors": 12, "queue_capacity": 40, "max_velocity": 3, "uavs": 3})

@@ -8,9 +8,9 @@ import pytest
 from service.deciding.rollout_evaluator import evaluate
 from service.deciding.rollout_state import RolloutState
 from shared.belief.fleet_belief import FleetBelief
-from shared.world.actions import Action
 from shared.world.channel import FloatArray, channel_gain_db
 from shared.world.scenario import SCENARIOS
+from shared.world.step_rule import Action
 
 PAPER = SCENARIOS["paper"]
 IDS = np.arange(2)

@@ -18,9 +18,9 @@ from service.llm.embedded import EmbeddedServer
 from service.llm.model_file import GGUF_NAME, GGUF_SHA256, sha256
 from service.llm.request_bodies import Rewriting
 from service.llm.server import LlmServer, ServerStatus
+from service.mission.prompt_fit import warm_up
 from service.prompting.compact_prompt import CompactTemplate
 from service.prompting.paper_prompt import Template
-from service.prompting.warm_up import warm_up
 from shared.world.scenario import SCENARIOS
 from tests.support.waiting import soon
 

@@ -6,7 +6,7 @@ from service.api.mission_answers import status_of
 from service.errors import Conflict, NotFound
 from service.mission.mission import Mission
 from shared.wire.schemas import Outcome
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 from tests.support.missions import attended, mission, uav
 
 

@@ -12,7 +12,7 @@ from service.errors import Refused
 from service.mission.events import Event, ReadingsMerged
 from service.mission.mission import Mission
 from shared.wire.readings import SensorReading
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 from tests.support.missions import attended, mission, uav
 
 

@@ -17,8 +17,8 @@ from service.prompting.candidates import Viewpoint
 from service.prompting.compact_prompt import SIGNS, CompactTemplate, Outlook, digits, sign
 from service.prompting.experiences import Experience
 from shared.wire.schemas import MissionSpec
-from shared.world.actions import Action
 from shared.world.scenario import SCENARIOS, Scenario
+from shared.world.step_rule import Action
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import decide_request
 from tests.support.missions import PAPER, attended

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from service.api.mission_answers import status_of
 from service.prompting.experiences import Experience, Experiences
 from shared.wire.schemas import MissionSpec, Outcome, PromptStyle, Selection
-from shared.world.actions import Action
+from shared.world.step_rule import Action
 from tests.support.missions import attended, mission, uav
 
 SELECTIONS: tuple[Selection, ...] = get_args(Selection)

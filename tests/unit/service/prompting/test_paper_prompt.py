@@ -10,8 +10,8 @@ from service.errors import Refused
 from service.prompting.paper_prompt import Template
 from service.prompting.prompt import Prompt
 from shared.wire.schemas import MissionSpec, Outcome, PromptStyle
-from shared.world.actions import Action
 from shared.world.scenario import SCENARIOS
+from shared.world.step_rule import Action
 from tests.support.missions import PAPER, attended, mission, uav
 
 
