@@ -1,7 +1,8 @@
-"""The ingress of a cluster: it forwards each request to the edge that owns its mission, and returns its answer."""
+"""``aicvds serve --ray``: the ingress in this process forwards each request to the edge that owns its mission."""
 
 import asyncio
 import logging
+import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any, Protocol
@@ -20,7 +21,9 @@ from service.api.problem_details import problem_response
 from service.cluster.exchange import Answer, Exchanged, merged_metrics, merged_missions, merged_readiness
 from service.config.settings import Settings
 from service.server.middleware import SecurityHeaders
+from service.server.server import Server
 from shared.kit.bounded import BoundedDict
+from shared.kit.ray_connection import LOCAL, RayUnusable, connected
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +31,7 @@ log = logging.getLogger(__name__)
 _SLACK_S = 0.2
 _CONNECT_S = 1.0
 _REMEMBERED = 10_000
+_LOOPBACK = "127.0.0.1"
 # Headers of one connection, which are not forwarded.
 _OF_A_CONNECTION = frozenset((b"connection", b"content-length", b"date", b"host", b"server", b"transfer-encoding"))
 _WHOLE_EDGE = frozenset((("GET", "/metrics"), ("GET", "/readyz"), ("GET", "/missions")))
@@ -203,3 +207,32 @@ def ingress_application(settings: Settings, owners: Owners, end: Callable[[], No
         ],
     )
     return app
+
+
+def serve_cluster(listener: socket.socket, settings: Settings, ray: str, least: int, most: int) -> Server:
+    """Serve until SIGTERM or Ctrl-C; returns the server, whose ``error`` is the reason of a failure.
+
+    There are ``least`` to ``most`` replicas, by load. Replicas on a Ray that was started here end with it; those on a
+    cluster continue, because other ingresses may use them. If they cannot start, ``error`` is a :class:`RayUnusable`.
+
+    Raises:
+        RayUnusable: Ray is not installed, or not at that address.
+    """
+
+    def load() -> Starlette:
+        # Ray reads its settings when it is imported, so this comes after the connection.
+        try:
+            from service.cluster.replicas import deployed, ended
+        except ModuleNotFoundError as missing:
+            raise RayUnusable(
+                f"--ray: {missing.name} is not installed. Install the extra: pip install 'aic-vds[ray]'"
+            ) from None
+
+        owners = deployed(settings, _LOOPBACK if ray == LOCAL else None, least, most)
+        return ingress_application(settings, owners, ended if ray == LOCAL else lambda: None)
+
+    with connected(ray, most):
+        server = Server(load, settings.log_level)
+        # At a signal, uvicorn ends the process after the application.
+        server.run(sockets=[listener])
+    return server

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from pydantic import ValidationError
 
+from service.commands.serve import fault_of_keys
 from service.config.settings import Settings, unknown_variables
 from shared.kit.validation_messages import problem_of
 from shared.wire.schemas import LLM_MODES
@@ -106,6 +107,8 @@ def findings(given: dict[str, Any]) -> Iterator[Finding]:
             yield Finding("settings", found, "see docs/reference/settings.md")
         return
     yield port_of(settings.host, settings.port)
+    if (refusal := fault_of_keys(settings, settings.host)) is not None:
+        yield Finding("keys", refusal, "aicvds keys add NAME --file FILE, and AICVDS_KEYS=FILE")
     yield Finding("settings", f"mode {settings.mode}, deadline {settings.deadline_ms} ms, top-k {settings.top_k}")
     yield store_of(settings)
     if settings.mode in LLM_MODES or "llm_url" in given:
@@ -148,7 +151,7 @@ def store_of(settings: Settings) -> Finding:
     file = Path(name).absolute()
     if not file.exists():
         folder = next(parent for parent in file.parents if parent.exists())
-        if not _writable(folder):
+        if not (folder.is_dir() and os.access(folder, os.W_OK)):
             return Finding("store", f"{file}: {folder} cannot be written", "aicvds serve --store FILE, or --store none")
         return Finding("store", f"{file} (new)")
     try:
@@ -215,6 +218,8 @@ def embedded(settings: Settings) -> Iterator[Finding]:
         yield Finding("LLM", str(error).partition(":")[0], "aicvds model fetch")
         return
     adapter = settings.embedded_adapter
+    if adapter is not None and not adapter.is_file():
+        yield Finding("LLM", f"adapter {adapter} is not there", "correct or unset AICVDS_LLM_ADAPTER")
     with_adapter = "no adapter" if adapter is None else f"adapter {adapter}"
     size = f"{file.stat().st_size / 1e6:.0f} MB"
     yield Finding("LLM", f"embedded, {file} ({size}), {with_adapter}, {settings.embedded_threads} threads")
@@ -226,7 +231,3 @@ def planner(settings: Settings) -> Finding:
         return Finding("planner", "off: one step of look-ahead")
     free_mb = shutil.disk_usage(Path.home()).free / 1e6
     return Finding("planner", f"numba {version('numba')}; {free_mb:,.0f} MB of disk free")
-
-
-def _writable(folder: Path) -> bool:
-    return folder.is_dir() and os.access(folder, os.W_OK)

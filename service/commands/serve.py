@@ -114,7 +114,6 @@ def main(argv: list[str]) -> int:
 
 def checked_settings(given: dict[str, Any], host: str | None = None) -> Settings | None:
     """The settings, where an edge can listen on ``host`` (by default its own); None once the faults are printed."""
-    from service.api.api_keys import BadKeys, KeyFile
     from service.config.settings import Settings, unknown_variables
 
     for name, meant in unknown_variables().items():
@@ -127,20 +126,26 @@ def checked_settings(given: dict[str, Any], host: str | None = None) -> Settings
             name = f"--{field.replace('_', '-')}" if field in given else f"AICVDS_{field.upper()}".removesuffix("_")
             _refused(f"{name}: {problem_of(fault)}")
         return None
-    host = host or settings.host
+    if (refusal := fault_of_keys(settings, host or settings.host)) is not None:
+        _refused(refusal)
+    return settings if refusal is None else None
+
+
+def fault_of_keys(settings: Settings, host: str) -> str | None:
+    """Why an edge does not listen on this host with the keys of its settings; None if it does."""
+    from service.api.api_keys import BadKeys, KeyFile
+
     if settings.keys is None and settings.anonymous == "off" and not _is_loopback(host):
-        _refused(
+        return (
             f"anyone who reaches {host} could control this fleet. Make a key with "
             "`aicvds keys add NAME --file keys.json`, set AICVDS_KEYS=keys.json, or say AICVDS_ANONYMOUS=on"
         )
-        return None
     if settings.keys is not None:
         try:
             KeyFile.read(settings.keys)
         except BadKeys as error:
-            _refused(f"AICVDS_KEYS: {error}")
-            return None
-    return settings
+            return f"AICVDS_KEYS: {error}"
+    return None
 
 
 def _serve(listener: socket.socket, settings: Settings, url: str) -> int:
@@ -161,7 +166,7 @@ def _serve(listener: socket.socket, settings: Settings, url: str) -> int:
 
 
 def _serve_cluster(listener: socket.socket, settings: Settings, ray: str, least: int, most: int) -> int:
-    from service.cluster.serving import serve_cluster
+    from service.cluster.ingress import serve_cluster
     from service.observability import logs
     from shared.kit.ray_connection import RayUnusable
 

@@ -10,7 +10,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.config.settings import Settings
 from service.edge.ownership import LeasedOwnership, SoleOwnership
-from service.errors import Conflict, Misdirected, Unavailable
+from service.errors import Conflict, Misdirected, Refused, Unavailable
 from service.mission.events import Decided, Event, GuidanceChanged, ReadingsMerged, Reported, Settled
 from service.mission.idempotency import Answered
 from service.mission.mission import Mission
@@ -165,12 +165,10 @@ class StoredMissions:
             log.error("mission %s is damaged: %s", mission_id, error)
             raise Conflict("mission_id", f"the stored mission {mission_id} is damaged: DELETE it") from None
         if not mission.prompt_fits:
-            limit = self._settings.llm_context
-            log.warning(
-                "mission %s: its prompt may exceed AICVDS_LLM_CONTEXT (%d); it continues without the LLM",
-                mission_id,
-                limit,
-            )
+            try:
+                mission.prompt_fit.check()
+            except Refused as why:
+                log.warning("mission %s continues without the LLM: %s; or DELETE it, and make it anew", mission_id, why)
         self._journal.resume(mission, stored.seq, stored.events, epoch)
         self._missions[mission_id] = mission
         self.listed.discard(mission_id)

@@ -1,5 +1,6 @@
 """The options that several commands share, and checks of them."""
 
+import hashlib
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -43,7 +44,7 @@ class WorldOptions:
     """UAVs in the scenario, 1 to 100. Default: the scenario's."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="FIELD=VALUE")] = ()
     """Another value for a field of the scenario, such as wind_mps=4 or link_share=0.5; repeatable. The fields are those
-    of shared/world/scenario.py. A changed scenario is named NAME_changed, unless name=... names it."""
+    of shared/world/scenario.py. A changed scenario is named NAME_changed and a number, unless name=... names it."""
 
 
 def site_of(options: WorldOptions) -> Site:
@@ -165,7 +166,9 @@ def scenario_from_options(name: str, steps: int | None = None, changes: Mapping[
     except ValueError as error:
         raise UsageError(f"--scenario: {error}") from None
     _check_steps(steps)
-    values = {**({"name": f"{name}_changed"} if changes else {}), **(changes or {})}
+    # Other changes have another name, so that a comparison notices.
+    digest = hashlib.blake2b(repr(sorted((changes or {}).items())).encode(), digest_size=2).hexdigest()
+    values = {**({"name": f"{name}_changed_{digest}"} if changes else {}), **(changes or {})}
     values |= {} if steps is None else {"steps": steps}
     try:
         return Scenario.model_validate({**scenario.model_dump(), **values}) if values else scenario

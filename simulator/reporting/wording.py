@@ -119,7 +119,7 @@ def bound_text(summary: Summary) -> str | None:
     lost, least, best = next(iter(summary.lost_packets.values())), summary.bound.lower_bound, summary.bound.best_flight
     text = f"Nobody can lose fewer than {_packets(least)} in this world; this mission lost {lost:,}."
     if best > least:
-        text += f" A search that knows all arrivals found a flight that loses {best:,}."
+        text += f" A search that knows all arrivals found a flight that loses {best:,}; `aicvds bound` searches longer."
     return text
 
 

@@ -51,7 +51,9 @@ def test_values_on_their_bounds_are_taken() -> None:
 def test_a_scenario_changes_by_options_and_is_named_so() -> None:
     site = site_of(WorldOptions(sensors=20, uavs=5, steps=4, set=("wind_mps=4", "layout=pipeline", "link_share=0.5")))
     expected = {"sensors": 20, "uavs": 5, "steps": 4, "wind_mps": 4.0, "layout": "pipeline", "link_share": 0.5}
-    assert site.scenario == SCENARIOS["paper"].model_copy(update={**expected, "name": "paper_changed"})
+    assert site.scenario == SCENARIOS["paper"].model_copy(update={**expected, "name": site.scenario.name})
+    other = site_of(WorldOptions(sensors=20, uavs=4)).scenario.name
+    assert site.scenario.name.startswith("paper_changed_") and other != site.scenario.name
     assert site_of(WorldOptions(scenario="stress", set=("name=mine",))).scenario.name == "mine"
     assert site_of(WorldOptions(steps=4)).scenario.name == "paper"
 
