@@ -65,6 +65,7 @@ KEYED = [
 # Their command lines are parsed and no more; by how they begin.
 PARSED = {
     "aicvds doctor": "its result is this machine's; tests/integration/service/commands/test_doctor.py runs it",
+    "aicvds simulate --policy fullest.py": "the reader's class; test_simulate.py flies one of its own",
     "aicvds serve --ray": "it needs a PostgreSQL; tests/faults/test_ray.py runs it",
     "aicvds mqtt": "it goes on until it is ended; tests/e2e/test_mqtt.py runs it with a broker",
     "aicvds fly": "it waits for vehicles; tests/unit/field/vehicles and tests/e2e/test_fly.py fly it",

@@ -81,7 +81,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_an_experiment_with_a_result_has_its_origin_data_figure_and_numbers(written: Path) -> None:
     text = section(written.read_text(), "scheduler")
     for part in (
-        "```sh\npython -m lab experiment scheduler --llm none\n```", "seeds 0 to 29 (30), LLM tiny.gguf",
+        "```sh\n.venv/bin/python -m lab experiment scheduler --llm none\n```", "seeds 0 to 29 (30), LLM tiny.gguf",
         "Commit 0123456789abcdef:", "[CSV](data/experiments/scheduler.csv)", "A note of the run.",
         "![What it shows.](figures/scheduler/totals.svg)",
         "| scheme | lost packets | loss events | to EOF |",
