@@ -17,6 +17,7 @@ from shared.world.scenario import Scenario
 
 # Most ended orders in memory.
 _MOST_ENDED = 1000
+_ANSWERED = ("confirmed", "rejected")
 
 
 class OperatorGuidance:
@@ -90,7 +91,7 @@ class OperatorGuidance:
                 raise Refused(f"guidance.{error.field}", error.detail) from None
             self._proposed, self._origin, self._failure = answer.guidance, "operator", None
             self._doubts, self._withdrawn, self.status = [], [], "confirmed"
-        elif answer.answer == "withdraw" or (answer.answer == "reject" and self.orders and self.status != "proposed"):
+        elif answer.answer == "withdraw" or (answer.answer == "reject" and self.orders and self.status in _ANSWERED):
             self._withdraw(answer.orders, step)
         elif self._proposed is None:
             raise Conflict(
@@ -106,10 +107,11 @@ class OperatorGuidance:
         else:
             self.status = "rejected"
 
-    def expire(self, step: int, visits: NDArray[np.int64]) -> bool:
-        """End the orders whose end has come before the decisions of a step; returns whether there are any.
+    def expire(self, step: int, first: int, visits: NDArray[np.int64]) -> bool:
+        """End the orders whose end has come before a decision of this step; returns whether there are any.
 
         Args:
+            first: the first step whose decisions are all without them.
             visits: the step of each sensor's last visit that succeeded, by sensor ID; -1 for never.
         """
         now = datetime.now(UTC)
@@ -121,7 +123,7 @@ class OperatorGuidance:
             or (end.visited is not None and visits[end.visited] >= self._in_force[name].since_step)
         ]
         if over:
-            self._change(self.confirmed.without(over), step, None)
+            self._change(self.confirmed.without(over), first, None)
         return bool(over)
 
     def _with(self, guidance: Guidance, withdrawn: Sequence[str], replaces: bool, step: int = 0) -> Guidance:

@@ -122,7 +122,7 @@ class Mission:
 
     def end_orders(self, step: int) -> None:
         """End the orders whose end has come, before a decision of this step; a replay has the event of it."""
-        if self.guidance.expire(max(step, self.visit_orders.last + 1), self.records.confirmed):
+        if self.guidance.expire(step, max(step, self.visit_orders.last + 1), self.records.confirmed):
             self._guidance_changed()
 
     def propose_guidance(

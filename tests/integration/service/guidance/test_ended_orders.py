@@ -38,8 +38,13 @@ def say(client: httpx.Client, **answer: Any) -> dict[str, Any]:
     return told
 
 
-@pytest.mark.parametrize("answer", ["withdraw", "reject"])
-@pytest.mark.parametrize("state", ["compiling", "failed", "confirmed", "rejected"])
+@pytest.mark.parametrize(
+    ("state", "answer"),
+    [
+        *((state, "withdraw") for state in ("compiling", "failed", "confirmed", "rejected")),
+        *((state, "reject") for state in ("confirmed", "rejected")),
+    ],
+)
 def test_orders_in_force_can_be_withdrawn_whatever_the_note(
     edge: Edge, report: Report, state: str, answer: str
 ) -> None:
@@ -67,6 +72,17 @@ def test_orders_in_force_can_be_withdrawn_whatever_the_note(
         assert client.post("/decide", json=report()).json()["velocity"] > 3
         # Withdrawn twice is withdrawn.
         assert say(client, answer="withdraw") == told
+
+
+def test_a_note_that_failed_cannot_be_rejected_and_ends_no_order(edge: Edge) -> None:
+    client = edge()
+    client.put("/missions/test", json={"mode": "value"})
+    say(client, guidance={"max_velocity": 3})
+    say(client, note=NOTE)
+    guidance(client, "failed")
+    refused = client.post(AT, json={"answer": "reject"})
+    assert refused.status_code == 409 and "there is nothing to reject" in refused.text
+    assert guidance(client, "failed")["obeyed_in_words"] == "Never fly faster than 3 m/s."
 
 
 def test_orders_are_withdrawn_beside_a_reading_that_still_waits(edge: Edge) -> None:

@@ -68,8 +68,10 @@ def test_an_order_ends_at_its_step(edge: Edge, report: Report, end: dict[str, An
     client.put("/missions/test", json={})
     told = say(client, guidance={**ended(**end), "max_velocity": 2})
     assert told["obeyed_in_words"] == f"{VISIT}. Never fly faster than 2 m/s, until step 3."
-    velocities = [client.post("/decide", json=report(step=step)).json()["velocity"] for step in range(4)]
-    assert max(velocities[:3]) <= 2 < velocities[3]
+    # The last decisions of the steps before it too, which come after the first UAV's.
+    asked = [report(step=step, uav_id=uav) for step in range(4) for uav in range(3)]
+    velocities = [client.post("/decide", json=body).json()["velocity"] for body in asked]
+    assert max(velocities[:9]) <= 2 < max(velocities[9:])
     told = client.get(AT).json()
     assert (told["obeyed_in_words"], told["ended"]) == (f"{VISIT}.", ["Never fly faster than 2 m/s, until step 3."])
     assert spans(told) == [("max_velocity", 0, 3), ("visit:4", 0, None)]
