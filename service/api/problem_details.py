@@ -46,7 +46,7 @@ def problem_response(
     """An ``application/problem+json`` response of the type ``kind``, which never repeats the request's content."""
     faults = [Fault(**error) for error in errors]
     body = Problem(type=kind, title=HTTPStatus(status).phrase, status=status, detail=detail, errors=faults, owner=owner)
-    return Response(body.model_dump_json(), status_code=status, media_type=CONTENT_TYPE)
+    return Response(body.model_dump_json(), status_code=int(status), media_type=CONTENT_TYPE)
 
 
 def refusal_of(error: Refused) -> Response:
