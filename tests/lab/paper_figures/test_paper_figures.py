@@ -29,7 +29,7 @@ def numbers(path: Path) -> list[dict[str, str]]:
 
 @pytest.fixture
 def brief(monkeypatch: pytest.MonkeyPatch) -> Scenario:
-    monkeypatch.setattr(command, "scenario_from_options", lambda name: BRIEF)
+    monkeypatch.setattr(command, "scenario_from_options", lambda name, changes: BRIEF)
     return BRIEF
 
 
