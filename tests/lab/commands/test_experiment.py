@@ -182,7 +182,6 @@ def test_the_embedded_llm_decides_and_draws_at_random_stand_beside_it(tmp_path: 
     result = result_in(tmp_path, "llm-models")
     assert list(result.schemes) == [
         "llm",
-        "llm_shown",
         "llm_chance",
         "guided",
         "value_reach",
@@ -190,7 +189,7 @@ def test_the_embedded_llm_decides_and_draws_at_random_stand_beside_it(tmp_path: 
         "eof",
         "random",
     ]
-    for asked in ("llm", "llm_shown", "llm_chance"):
+    for asked in ("llm", "llm_chance"):
         assert result.schemes[asked]["llm_decided_pct"].mean > 60
     for unasked in ("value_reach", "edge_policy"):
         assert result.schemes[unasked]["llm_decided_pct"].mean == 0
