@@ -49,6 +49,22 @@ def test_a_taken_port_and_bad_settings_have_remedies(
     assert "AICVDS_TOP_K: must be greater" in printed and printed.count("2 in the way") == 2
 
 
+def test_keys_that_serve_refuses_are_in_the_way(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("AICVDS_MODE", "value")
+    faults = [one.found for one in doctor.findings({"host": "0.0.0.0", "port": 0}) if one.what == "keys"]
+    assert len(faults) == 1 and "anyone who reaches 0.0.0.0 could control this fleet" in faults[0]
+    monkeypatch.setenv("AICVDS_KEYS", str(tmp_path / "none.json"))
+    faults = [one.found for one in doctor.findings({"port": 0}) if one.what == "keys"]
+    assert len(faults) == 1 and "none.json" in faults[0]
+
+
+def test_a_missing_adapter_is_in_the_way(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    model = tmp_path / "model.gguf"
+    model.touch()
+    found, *_ = doctor.embedded(Settings(llm_gguf=model, llm_adapter=str(tmp_path / "none.gguf")))
+    assert "none.gguf is not there" in found.found and found.remedy is not None and "AICVDS_LLM_ADAPTER" in found.remedy
+
+
 def test_a_locked_store_names_its_file(tmp_path: Path) -> None:
     file = tmp_path / "missions.db"
     file.touch()

@@ -361,6 +361,17 @@ def test_a_mission_whose_prompt_no_longer_fits_flies_on_without_the_llm(
             assert client.get("/missions/test").json()["decisions"] == 2
             assert len(model.bodies) == asked
             assert client.put("/missions/new", json=spec).status_code == 422
-    assert [record.getMessage() for record in caplog.records if "AICVDS_LLM_CONTEXT" in record.getMessage()] == [
-        "mission test: its prompt may exceed AICVDS_LLM_CONTEXT (1024); it continues without the LLM"
-    ]
+    [warned] = [one.getMessage() for one in caplog.records if "AICVDS_LLM_CONTEXT" in one.getMessage()]
+    assert warned.startswith("mission test continues without the LLM: prompt: 100 experiences and ")
+    assert "AICVDS_LLM_CONTEXT is 1024: raise it" in warned and warned.endswith("; or DELETE it, and make it anew")
+
+
+def test_a_mission_of_the_adapter_says_why_another_llm_is_not_asked(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with running(tmp_path / "m.db", mode="llm", llm_gguf="none", llm_adapter="served") as (client, _):
+        assert client.put("/missions/test", json={}).json()["prompt"]["format"] == "compact"
+    with running(tmp_path / "m.db", mode="llm", llm_gguf="none", llm_adapter="off") as (client, _):
+        assert client.get("/missions/test").status_code == 200
+    [warned] = [one.getMessage() for one in caplog.records if "without the LLM" in one.getMessage()]
+    assert "compact needs an LLM with an adapter" in warned and "AICVDS_LLM_CONTEXT" not in warned
