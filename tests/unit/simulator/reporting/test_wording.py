@@ -154,7 +154,8 @@ def test_the_bound_is_beside_the_loss(flight: Flight) -> None:
     tight = summary.model_copy(update={"bound": LossBound(lower_bound=1, best_flight=1, seconds=1.0)})
     assert bound_text(tight) == "Nobody can lose fewer than 1 packet in this world; this mission lost 9."
     loose = summary.model_copy(update={"bound": LossBound(lower_bound=1, best_flight=3, seconds=1.0)})
-    assert bound_text(loose) == f"{bound_text(tight)} A search that knows all arrivals found a flight that loses 3."
+    longer = "A search that knows all arrivals found a flight that loses 3; `aicvds bound` searches longer."
+    assert bound_text(loose) == f"{bound_text(tight)} {longer}"
 
 
 def test_a_share_is_rounded_to_0_or_1_only_if_it_is() -> None:
