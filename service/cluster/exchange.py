@@ -28,6 +28,10 @@ _LONGEST_MS = 60_000
 _SENT = ("type", "http_version", "method", "scheme", "path", "raw_path", "query_string", "root_path", "headers")
 
 
+class OwnersGone(Exception):
+    """The responsible edge has died, or does not answer in time."""
+
+
 @dataclass
 class Answer:
     """A buffered answer."""

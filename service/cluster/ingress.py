@@ -18,7 +18,7 @@ from starlette.types import Receive, Scope, Send
 from service.api.authentication import KnownHosts
 from service.api.load_limits import RequestLimits
 from service.api.problem_details import problem_response
-from service.cluster.exchange import Answer, Exchanged, merged_metrics, merged_missions, merged_readiness
+from service.cluster.exchange import Answer, Exchanged, OwnersGone, merged_metrics, merged_missions, merged_readiness
 from service.config.settings import Settings
 from service.server.middleware import SecurityHeaders
 from service.server.server import Server
@@ -35,10 +35,6 @@ _LOOPBACK = "127.0.0.1"
 # Headers of one connection, which are not forwarded.
 _OF_A_CONNECTION = frozenset((b"connection", b"content-length", b"date", b"host", b"server", b"transfer-encoding"))
 _WHOLE_EDGE = frozenset((("GET", "/metrics"), ("GET", "/readyz"), ("GET", "/missions")))
-
-
-class OwnersGone(Exception):
-    """The responsible edge has died, or does not answer in time."""
 
 
 class Owners(Protocol):

@@ -17,8 +17,7 @@ from ray.serve.config import AutoscalingConfig, RequestRouterConfig
 from ray.serve.exceptions import RayServeException
 from ray.serve.schema import LoggingConfig
 
-from service.cluster.exchange import DECIDED_AT, Answer, Exchanged, answer_of
-from service.cluster.ingress import OwnersGone
+from service.cluster.exchange import DECIDED_AT, Answer, Exchanged, OwnersGone, answer_of
 from service.config.settings import Settings
 from service.observability import logs
 from service.server.server import Server

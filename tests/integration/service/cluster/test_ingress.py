@@ -14,8 +14,8 @@ from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 from starlette.testclient import TestClient
 
-from service.cluster.exchange import DECIDED_AT, Answer, Exchanged
-from service.cluster.ingress import OwnersGone, ingress_application
+from service.cluster.exchange import DECIDED_AT, Answer, Exchanged, OwnersGone
+from service.cluster.ingress import ingress_application
 from service.config.settings import Settings
 from shared.wire.missions import MissionLine, MissionList
 from shared.wire.schemas import Readiness
