@@ -50,12 +50,7 @@ def as_queues(
     urgency = urgency_of(queue, overflow, scenario)
     shown = Reach.of(reach.links, np.where(state.able, queue, 0.0), urgency)
     ordered = replace(
-        state,
-        queue=queue,
-        rate=rate,
-        overflow=overflow,
-        urgency=urgency,
-        reach=None if state.reach is None else shown,
+        state, queue=queue, rate=rate, overflow=overflow, urgency=urgency, reach=None if state.reach is None else shown
     )
     return ordered, shown
 

@@ -125,11 +125,7 @@ class _Flight(NamedTuple):
 
 
 def fly_candidates(
-    world: FlownWorld,
-    futures: SampledFutures,
-    own: int,
-    first: NDArray[np.int64],
-    plans: dict[int, NDArray[np.int64]],
+    world: FlownWorld, futures: SampledFutures, own: int, first: NDArray[np.int64], plans: dict[int, NDArray[np.int64]]
 ) -> tuple[FloatArray, FloatArray]:
     """Fly each of K candidates through each of M futures.
 
@@ -212,13 +208,7 @@ def _fly_candidate(
 
 @inlined
 def _continue(
-    world: FlownWorld,
-    fades: FloatArray,
-    planned: NDArray[np.int64],
-    flight: _Flight,
-    future: int,
-    step: int,
-    uav: int,
+    world: FlownWorld, fades: FloatArray, planned: NDArray[np.int64], flight: _Flight, future: int, step: int, uav: int
 ) -> None:
     """Fly a UAV's step: its decision, the plan's step, or look-ahead's where the plan is shorter."""
     sensor, velocity = -1, 0

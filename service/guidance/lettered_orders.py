@@ -121,6 +121,8 @@ class _Orders:
             return self._wish("visit", words[:-1], 1)
         if len(words) < 3 or words[-2] != "every":
             raise BadOrders("a visit has no period")
+        if words[-1] in words[:-2]:
+            raise BadOrders("a number is both a sensor and a period")
         return self._wish("visit", words[:-2], self._period(words[-1]))
 
     def _ignore(self, words: list[str]) -> None:

@@ -45,6 +45,7 @@ _NUMBER = re.compile(
     r"|(?<=every )(?P<alternate>other|alternate)\b"
     rf"|\b(?P<tens>{_any(_TENS)})[- ](?P<ones>{_any(CARDINALS[1:10])})\b"
     rf"|\b(?P<word>{_any({*CARDINALS, *ORDINALS, *_TENS, *_FACTORS} - {'second'})})\b"
+    r"|(?P<one>(?<!s )(?<!m )(?<!half )\ban?(?= (?:minute|hour)\b)|(?:(?<=every )|(?<=each ))(?=(?:minute|hour)\b))"
 )
 _UNITS = {
     "km/h": r"km/h|kmh|kph|kilomet(?:re|er)s? (?:per|an) hour",
@@ -61,7 +62,7 @@ _UNITS = {
     "m²": r"m²",
 }
 _UNIT = re.compile(
-    r"[ -]?(?:" + "|".join(f"(?P<u{i}>{words})" for i, words in enumerate(_UNITS.values())) + r")(?![\w/])"
+    rf"(?:(?<=half) an?)?[ -]?(?:{'|'.join(f'(?P<u{i}>{words})' for i, words in enumerate(_UNITS.values()))})(?![\w/])"
 )
 
 
@@ -125,7 +126,7 @@ def _value(match: re.Match[str]) -> float | None:
         return float(match["digits"][:9])
     if match["tens"]:
         return 10.0 * (_TENS.index(match["tens"]) + 2) + CARDINALS.index(match["ones"])
-    word = match[0]
+    word = match["word"] or match["second"] or match["alternate"] or "one"
     if word in _TELLING:
         return _TELLING[word]
     for words in (CARDINALS, ORDINALS):

@@ -14,12 +14,13 @@ from typing import Any
 
 from service.guidance.lettered_orders import SEPARATOR, meaning
 from service.guidance.note_numbers import CARDINALS, ORDINALS, LetteredNote, Number, numbers_of
+from service.guidance.note_orders import BadOrders
 from shared.planning.orders import NO_GUIDANCE, End, Guidance
 from shared.world.scenario import Scenario
 
 _TABLE = tomllib.loads(files("service.guidance").joinpath("note_phrases.toml").read_text(encoding="utf-8"))
 _STOP = re.compile(r"[.;!?](?=\s|$)")
-_CLAUSE = re.compile(r"(?:[^.,;:!?]|[.,:](?=\S))+?(?=[.,;:!?](?:\s|$)| and | but | - |$)")
+_CLAUSE = re.compile(r"(?:[^.,;:!?]|[.,:](?=\S))+?(?=[.,;:!?](?:\s|$)| and | but | - |\n|$)")
 _VELOCITIES = ("m/s", "km/h", "mph", "kn")
 _SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
@@ -33,7 +34,7 @@ def _pattern(phrase: str) -> re.Pattern[str]:
 _PARTS: dict[str, str] = {**_TABLE["parts"], "words": "|".join([*CARDINALS[::-1], *ORDINALS])}
 _ROWS = {kind: [(row, [_pattern(p) for p in row["phrases"]]) for row in _TABLE[kind]] for kind in ("withdraw", "order")}
 _ENDS = {kind: [_pattern(phrase) for phrase in phrases] for kind, phrases in _TABLE["ends"].items()}
-_KINDS = ("conditional", "limited", "once", "times", "added")
+_KINDS = ("conditional", "limited", "once", "times", "added", "lifts", "whole", "place", "apart")
 _PHRASES = {kind: [_pattern(phrase) for phrase in _TABLE[kind]["phrases"]] for kind in _KINDS}
 _Matches = Iterator[re.Match[str]]
 
@@ -98,9 +99,13 @@ class PhrasedNote:
             numbers: the numbers of the rest that its orders use.
         """
         own = self._read_orders()
-        values = {**read.values, **own.values, **self._once}
-        ends = {**read.ends, **{name: End(visited=int(name[6:])) for name in self._once}}
-        doubts = list(self._doubts)
+        refused = self._refused(read.values)
+        values = {**{n: v for n, v in read.values.items() if n not in refused}, **own.values, **self._once}
+        if refused and not values and not self.withdrawn:
+            raise BadOrders(f"“{next(iter(refused.values()))}” may end an order or mean a part of the fleet")
+        ends = {name: end for name, end in read.ends.items() if name in values}
+        ends |= {name: End(visited=int(name[6:])) for name in self._once}
+        doubts = self._doubts + [f"In no order: “{words}”." for words in dict.fromkeys(refused.values())]
         for match, kind, end in self._ends:
             names = [n for n in values if n not in self._once and self._in_sentence(n, values[n], match.start())]
             for name in names if end is not None or kind == "visited" else ():
@@ -112,6 +117,22 @@ class PhrasedNote:
         doubts += [f"In no order: “{clause}”." for clause in self._unread(values, numbers)]
         return Guidance.of(values, ends), doubts
 
+    def _refused(self, values: Mapping[str, float]) -> dict[str, str]:
+        """The LLM's orders that its words may end or permit, or that no word gives to every sensor, with the words."""
+        refused = {}
+        clauses = [" ".join(clause[0].split()) for clause in _CLAUSE.finditer(self.rest)]
+        for name, value in values.items():
+            kind = name.partition(":")[0]
+            near = [c for c in clauses if _uses(name, value, numbers_of(c))]
+            near = near or [c for c in clauses if re.search(_TABLE["asks"][kind], c)]
+            if (value or kind != "weight") and near and all(_has("lifts", clause) for clause in near):
+                refused[name] = near[0]
+        visits = [name for name in values if name.startswith("visit:")]
+        whole = any(_has("whole", clause) and not _has("place", clause) for clause in clauses)
+        if not whole and len(visits) == self._scenario.sensors > len(numbers_of(self.rest)):
+            refused |= dict.fromkeys(visits, " ".join(self.rest.split()))
+        return refused
+
     def _taken(self, patterns: list[re.Pattern[str]], wanted: Callable[[re.Match[str]], bool] = bool) -> _Matches:
         for pattern in patterns:
             for match in filter(wanted, pattern.finditer(self.rest)):
@@ -121,7 +142,7 @@ class PhrasedNote:
     def _says(self, kind: str, match: re.Match[str]) -> bool:
         """Whether the sentence of a phrase has words of a kind."""
         sentence = _STOP.split(self._lowered[: match.start()])[-1] + _STOP.split(self._lowered[match.start() :])[0]
-        return any(pattern.search(sentence) for pattern in _PHRASES[kind])
+        return _has(kind, sentence)
 
     def _withdraws(self, row: Mapping[str, Any], in_force: Collection[str], match: re.Match[str]) -> bool:
         known = not row.get("in_force") or any(matching(in_force, name) for name in _names(row, match))
@@ -167,11 +188,18 @@ class PhrasedNote:
         return int(number) if kind == "visit" else sensors.pop() if len(sensors) == 1 else None
 
     def _in_sentence(self, name: str, value: float, at: int) -> bool:
-        """Whether an order's numbers are not only in other sentences than the one at this place."""
-        sentence = len(_STOP.findall(self._lowered[:at]))
+        """Whether an order's numbers are not only elsewhere than where an end at this place belongs.
+
+        An end belongs to its sentence; to the words before it if no comma comes between them.
+        """
+        stops = [0, *(stop.end() for stop in _STOP.finditer(self._lowered)), len(self._lowered)]
+        sentence = (max(stop for stop in stops if stop <= at), min(stop for stop in stops if stop > at))
+        (apart,) = _PHRASES["apart"]
+        begin = max((found.end() for found in apart.finditer(self._lowered, sentence[0], at)), default=sentence[0])
         ends = [match.span() for match, _, _ in self._ends]
         numbers = [n for n in numbers_of(self._lowered) if not any(begin <= n.begin < end for begin, end in ends)]
-        here = [n for n in numbers if len(_STOP.findall(self._lowered[: n.begin])) == sentence]
+        before, around = ([n for n in numbers if b <= n.begin < e] for b, e in ((begin, at), sentence))
+        here = before or around
         return _uses(name, value, here) or not _uses(name, value, numbers)
 
     def _unread(self, values: Mapping[str, float], used: Collection[float]) -> Iterator[str]:
@@ -179,9 +207,14 @@ class PhrasedNote:
             numbers = [n for n in numbers_of(clause[0]) if clause[0][n.begin : n.end] not in ("one", "first", "second")]
             asked = [kind for kind, words in _TABLE["asks"].items() if re.search(words, clause[0])]
             lost = numbers and not all(number.value in used for number in numbers)
+            part = asked or _has("whole", clause[0]) or any(number.unit in _VELOCITIES for number in numbers)
             ignored = not numbers and any(not any(name.startswith(kind) for name in values) for kind in asked)
-            if lost or ignored:
+            if lost or ignored or (part and _has("place", clause[0])):
                 yield " ".join(re.sub(r"^\W*(?:and|but|then)\b", "", clause[0]).split())
+
+
+def _has(kind: str, text: str) -> bool:
+    return any(pattern.search(text) for pattern in _PHRASES[kind])
 
 
 def _uses(name: str, value: float, numbers: list[Number]) -> bool:

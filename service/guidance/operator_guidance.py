@@ -60,6 +60,9 @@ class OperatorGuidance:
             self.status, self._proposed, self._model = "proposed", guidance, model
             self._origin = "llm" if model else "phrases"
             self._doubts, self._withdrawn = list(doubts), list(withdrawn)
+            if model:
+                both = {*guidance.each_in_words().values()} & {*self.confirmed.each_in_words().values()}
+                self._doubts += [f"In force already: “{order}” If the note ends it, withdraw it." for order in both]
 
     def fail(self, reason: str, model: str | None) -> None:
         """Record that the note was not compiled."""

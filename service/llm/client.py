@@ -245,10 +245,7 @@ def client_of(settings: Settings) -> LLMClient:
         api_key=settings.llm_api_key.get_secret_value() if settings.llm_api_key else None,
         session_header=settings.llm_session_header,
         extras=RequestExtras(
-            settings.llm_extra_body,
-            settings.llm_extra_headers,
-            settings.llm_extra_query,
-            settings.llm_thinking_tokens,
+            settings.llm_extra_body, settings.llm_extra_headers, settings.llm_extra_query, settings.llm_thinking_tokens
         ),
     )
 

@@ -142,9 +142,7 @@ class Metrics:
         )
 
         self.keys_lost = Gauge(
-            "aicvds_keys_lost",
-            "Whether the file of API keys cannot be read and the previous keys apply",
-            registry=r,
+            "aicvds_keys_lost", "Whether the file of API keys cannot be read and the previous keys apply", registry=r
         )
 
     def _add_outcomes(self) -> None:

@@ -6,16 +6,7 @@ What never changes comes first, for the LLM server's prefix cache: so the cost f
 from collections.abc import Sequence
 
 from service.prompting.prompt import Prompt, note_block
-from service.prompting.rows import (
-    EXPERIENCE_NOTE,
-    UNKNOWN,
-    Cells,
-    cells,
-    columns,
-    experience,
-    introduction,
-    row,
-)
+from service.prompting.rows import EXPERIENCE_NOTE, UNKNOWN, Cells, cells, columns, experience, introduction, row
 from service.prompting.unpruned_state import UnprunedState
 from shared.features.augmented_state import State
 from shared.wire.schemas import Features

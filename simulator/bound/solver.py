@@ -87,12 +87,7 @@ class Interrupted(KeyboardInterrupt):
         self.plan = plan
 
 
-def plan(
-    problem: FleetProblem,
-    budget: Budget,
-    links: Links = "exact",
-    hint: IntArray | None = None,
-) -> Plan:
+def plan(problem: FleetProblem, budget: Budget, links: Links = "exact", hint: IntArray | None = None) -> Plan:
     """Search once.
 
     Args:

@@ -242,10 +242,7 @@ def tokens_per_step(decisions: Sequence[Decision]) -> PaperFigure:
             (panels[0], "prompt", "uncompressed", "whole prompt"),
             (panels[1], "state", "state_uncompressed", "state block"),
         ):
-            for key, label, (colour, dash, marker) in (
-                (full, "every sensor", IN_FULL),
-                (sent, "as sent", AS_SENT),
-            ):
+            for key, label, (colour, dash, marker) in ((full, "every sensor", IN_FULL), (sent, "as sent", AS_SENT)):
                 means = [float(np.mean([getattr(t, key) for t in by_step[s]])) for s in steps]
                 axes.plot(steps, means, color=colour, linestyle=dash, marker=marker, markersize=2.8, label=label)
             axes.set_title(title)

@@ -55,11 +55,7 @@ class Playback:
 
 
 def playback(
-    scenario: Scenario,
-    sensor_xy: np.ndarray,
-    decisions: Iterable[Decision],
-    instants: Sequence[Instant],
-    stride: int,
+    scenario: Scenario, sensor_xy: np.ndarray, decisions: Iterable[Decision], instants: Sequence[Instant], stride: int
 ) -> Playback | None:
     """The playback of a mission; ``None`` where no step was flown.
 

@@ -46,10 +46,20 @@ def test_numbers_become_letters_and_keep_what_says_more_than_a_number() -> None:
         ("sensors 3-6", [3, 6]),
         ("the 3rd", [3]),
         ("be careful", []),
+        ("no longer than a minute", [1]),
+        ("3 metres a second, 20 miles an hour", [3, 20]),
     ],
 )
 def test_number_words_are_numbers_where_they_mean_one(note: str, values: list[float]) -> None:
     assert [number.value for number in numbers_of(note)] == values
+
+
+@pytest.mark.parametrize(
+    ("note", "seconds"), [("a minute", 60), ("every minute", 60), ("an hour", 3600), ("half an hour", 1800)]
+)
+def test_a_time_without_a_number_is_one(note: str, seconds: float) -> None:
+    (number,) = numbers_of(note)
+    assert number.value * {"min": 60, "h": 3600}[str(number.unit)] == seconds
 
 
 @given(st.text(max_size=300), st.integers(0, 5))
@@ -124,6 +134,7 @@ def test_what_is_in_no_order_is_a_doubt() -> None:
         ("visit {4} every {1}", "there is no sensor 2.5"),
         ("visit always", "names no sensor"),
         ("visit {0} {1}", "a visit has no period"),
+        ("visit {0} {3} every {3}", "both a sensor and a period"),
         ("visit {0} every {1}; visit {0} every {3}", "ordered twice"),
         ("min {2}; min {3}", "ordered twice"),
         ("avoid {5}", "none of the velocities"),

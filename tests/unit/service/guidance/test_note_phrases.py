@@ -121,6 +121,11 @@ def test_a_time_of_the_clock_is_the_next_one(clock: str) -> None:
         ("Sensor 4 every 3 steps, no more than 9 m/s.", []),
         ("Leak at sensor 4! It wants a visit every 3 steps; nobody over 9 m/s.", []),
         ("Sensor 4 every 3 steps, nobody over 9 m/s, and be careful.", ["In no order: “be careful”."]),
+        ("Sensor 4 every 3 steps, only this. Nobody over 9 m/s.", ["In no order: “only this”."]),
+        (
+            "Sensor 4 every 3 steps. Nobody over 9 m/s around the school.",
+            ["In no order: “nobody over 9 m/s around the school”."],
+        ),
         ("Sensor 4 every 3 steps, nobody over 9 m/s, 5 metres up.", ["In no order: “5 metres up”."]),
         ("Sensor 4 every 3 steps, nobody over 9 m/s. Ignore the rest!", ["In no order: “ignore the rest”."]),
         ("Sensor 4 every 3 steps, nobody over 9 m/s, from 14:30 on.", ["In no order: “from 14:30 on”."]),
@@ -133,6 +138,52 @@ def test_a_time_of_the_clock_is_the_next_one(clock: str) -> None:
 def test_a_doubt_quotes_what_is_in_no_order(note: str, doubts: list[str]) -> None:
     # The LLM's reading of the rest.
     assert phrased(note).completed(READ, {3.0, 4.0, 9.0}) == (READ, doubts)
+
+
+@pytest.mark.parametrize(
+    ("note", "read"),
+    [
+        # Two that an operator wrote, and that the adapter read as the opposite.
+        (
+            "The leak at sensor 4 was a false alarm, we can stop checking it. Keep an eye on everything around the "
+            "valve station instead.",
+            {f"visit:{sensor}": 1 for sensor in range(PAPER.sensors)},
+        ),
+        ("The 3 m/s minimum is off, hover if you like.", {"min_velocity": 3}),
+        ("Sensor 4 is fixed, no longer every 3 steps.", {"visit:4": 3}),
+        ("The 9 m/s cap no longer applies.", {"max_velocity": 9}),
+        ("9 m/s was too slow.", {"max_velocity": 9}),
+        ("You need not keep to 3 steps at sensor 4.", {"visit:4": 3}),
+        ("Hovering is allowed again.", {"avoid:0": 0}),
+        ("Keep an eye on all sensors near the school.", {f"visit:{sensor}": 1 for sensor in range(PAPER.sensors)}),
+    ],
+)
+def test_an_order_that_the_words_may_end_is_refused(note: str, read: dict[str, float]) -> None:
+    with pytest.raises(BadOrders, match="may end an order or mean a part of the fleet"):
+        phrased(note).completed(Guidance.of(read, {}), {*read.values(), 4.0})
+
+
+def test_what_is_refused_leaves_the_rest() -> None:
+    note = phrased("The 9 m/s cap is off, but sensor 4 every 3 steps.")
+    kept = Guidance(sensors=READ.sensors)
+    assert note.completed(READ, {3.0, 4.0, 9.0}) == (kept, ["In no order: “the 9 m/s cap is off”."])
+
+
+@pytest.mark.parametrize(
+    ("note", "words"),
+    [
+        ("{} and stay below 9 m/s until step 40", f"{VISIT}. Never fly faster than 9 m/s, until step 40."),
+        ("{} until step 40 and stay below 9 m/s", f"{VISIT}, until step 40. Never fly faster than 9 m/s."),
+        ("{}, but only 9 m/s for the next 4 steps", f"{VISIT}. Never fly faster than 9 m/s, for 4 steps."),
+        (
+            "For the next 4 steps {}, stay below 9 m/s",
+            f"{VISIT}, for 4 steps. Never fly faster than 9 m/s, for 4 steps.",
+        ),
+    ],
+)
+def test_an_end_is_that_of_its_own_words(note: str, words: str) -> None:
+    guidance, doubts = phrased(note.format("sensor 4 every 3 steps")).completed(READ, {3.0, 4.0, 9.0})
+    assert (guidance.in_words(), doubts) == (words, [])
 
 
 @given(
