@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from itertools import islice
 from typing import Any, Literal
 
@@ -44,31 +45,18 @@ class MqttMetrics:
 
     def __init__(self) -> None:
         self.registry = r = CollectorRegistry()
-        self.uplinks = Counter(
-            "aicvds_mqtt_uplinks", "Messages of the broker by what became of them", ["result"], registry=r
-        )
-        self.readings = Counter(
-            "aicvds_mqtt_readings", "Readings sent to the edge by its answer", ["result"], registry=r
-        )
-        self.failures = Counter("aicvds_mqtt_edge_failures", "Requests that the edge did not answer well", registry=r)
-        self.connects = Counter("aicvds_mqtt_connects", "Connections to the broker by result", ["result"], registry=r)
-        self.connected = Gauge("aicvds_mqtt_connected", "Whether the broker is subscribed to, 1 or 0", registry=r)
-        self.waiting = Gauge("aicvds_mqtt_waiting", "Readings that wait for the edge, at most one a device", registry=r)
-        self.age_s = Histogram(
-            "aicvds_mqtt_age_seconds", "Age of a reading as it is sent to the edge", registry=r, buckets=_AGE_BUCKETS_S
-        )
-        self.rssi_dbm = Histogram(
-            "aicvds_mqtt_rssi_dbm",
-            "Signal strength at the gateway that heard an uplink best",
-            registry=r,
-            buckets=_RSSI_BUCKETS_DBM,
-        )
-        self.snr_db = Histogram(
-            "aicvds_mqtt_snr_db",
-            "Signal-to-noise ratio at the gateway that heard an uplink best",
-            registry=r,
-            buckets=_SNR_BUCKETS_DB,
-        )
+        counter, gauge = partial(Counter, registry=r), partial(Gauge, registry=r)
+        histogram = partial(Histogram, registry=r)
+        self.uplinks = counter("aicvds_mqtt_uplinks", "Messages of the broker by what became of them", ["result"])
+        self.readings = counter("aicvds_mqtt_readings", "Readings sent to the edge by its answer", ["result"])
+        self.failures = counter("aicvds_mqtt_edge_failures", "Requests that the edge did not answer well")
+        self.connects = counter("aicvds_mqtt_connects", "Connections to the broker by result", ["result"])
+        self.connected = gauge("aicvds_mqtt_connected", "Whether the broker is subscribed to, 1 or 0")
+        self.waiting = gauge("aicvds_mqtt_waiting", "Readings that wait for the edge, at most one a device")
+        sent, best = "Age of a reading as it is sent to the edge", "at the gateway that heard an uplink best"
+        self.age_s = histogram("aicvds_mqtt_age_seconds", sent, buckets=_AGE_BUCKETS_S)
+        self.rssi_dbm = histogram("aicvds_mqtt_rssi_dbm", f"Signal strength {best}", buckets=_RSSI_BUCKETS_DBM)
+        self.snr_db = histogram("aicvds_mqtt_snr_db", f"Signal-to-noise ratio {best}", buckets=_SNR_BUCKETS_DB)
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from shared.kit.validation_messages import suggestion
 from simulator.commands.options import check_between, edge_from_option, site_from_options
 from simulator.commands.running import command_main
 from simulator.errors import UsageError
+from simulator.policies.registry import policy_named
 
 SEEDS, LLM_SEEDS = 30, 10
 PAGE, MAP, FIGURES = "page", "claims-map", "paper-figures"
@@ -44,6 +45,10 @@ class ExperimentOptions(ScenarioChanges):  # noqa: D101
     Without an LLM, a minute:  python -m lab experiment fairness --llm none
 
     All results beside the paper's numbers, as a page:  python -m lab experiment {PAGE} --help
+
+    A policy of your own beside the shipped ones:
+
+        python -m lab experiment scheduler --llm none --policy mine.py:Mine --scheme eof --scheme wqcs
 
     Where the paper's claims hold, a map over its open numbers:  python -m lab experiment {MAP} --help
 
@@ -77,6 +82,8 @@ class ExperimentOptions(ScenarioChanges):  # noqa: D101
     """A world of your own instead of a scenario: a folder, as for `aicvds simulate --world`."""
     scheme: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = ()
     """Fly this scheme alone, by its name in results.json; repeatable. Default: every scheme of the experiment."""
+    policy: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="MODULE:CLASS")] = ()
+    """Fly this policy of yours too, or FILE.py:CLASS, in the same worlds; repeatable (docs/guides/policy.md)."""
     workers: Annotated[int, arg(metavar="N")] = 1
     """Processes for the flights without an edge."""
     ray: Annotated[str | None, arg(metavar="local|HOST:PORT", help_behavior_hint="")] = None
@@ -138,6 +145,10 @@ def setup_of(options: ExperimentOptions) -> Setup:
     for model in options.model:
         if not model.is_file():
             raise UsageError(f"--model {model}: there is no such file")
+    for own in options.policy:
+        if ":" not in own:
+            raise UsageError(f"--policy {own}: write MODULE:CLASS or FILE.py:CLASS; --scheme names a shipped one")
+        policy_named(own)
     if options.llm not in ("embedded", "none") and not options.llm.startswith(("http://", "https://")):
         raise UsageError(f"--llm {options.llm}: choose embedded, none, or a URL such as http://127.0.0.1:8080/v1")
     site = site_from_options(options.scenario, options.world, options.steps, options.changes)
@@ -148,7 +159,7 @@ def setup_of(options: ExperimentOptions) -> Setup:
     pace: Literal["full", "quick"] = "quick" if options.quick else "full"
     edge = None if options.edge is None else edge_from_option(options.edge)
     llm, llm_seeds = Llm(options.llm, edge), min(llm_seeds, seeds)
-    return Setup(sites, llm, options.model, seeds, llm_seeds, options.steps, pace, options.scheme)
+    return Setup(sites, llm, options.model, seeds, llm_seeds, options.steps, pace, options.scheme, options.policy)
 
 
 def show(result: Result, console: Console) -> None:

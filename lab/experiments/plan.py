@@ -7,13 +7,15 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from hashlib import sha256
 from importlib.resources import files
+from inspect import getfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from lab.experiments.edges import Llm
 from lab.experiments.flight import flight_key
 from lab.experiments.result import Sweep
-from lab.experiments.schemes import PLANNERS, Clairvoyant, Informed, Local, OverEdge, Scheme
+from lab.experiments.schemes import PLANNERS, Clairvoyant, Informed, Local, OverEdge, Scheme, local
+from shared.kit.own_code import imported
 
 if TYPE_CHECKING:
     from simulator.sites.site import Site
@@ -29,7 +31,7 @@ class Setup:
 
     ``sites`` are the worlds by name; an experiment flies the first one, and those that it names. ``seeds`` and
     ``llm_seeds`` are numbers of seeds, from 0. ``steps`` are those of a mission, or ``None`` for the scenario's.
-    ``only`` names the schemes to fly, or none for all.
+    ``only`` names the schemes to fly, or none for all. ``policies`` are the user's own, flown beside the schemes.
     """
 
     sites: dict[str, Site]
@@ -40,6 +42,7 @@ class Setup:
     steps: int | None = None
     pace: Literal["full", "quick"] = "full"
     only: tuple[str, ...] = ()
+    policies: tuple[str, ...] = ()
 
     @property
     def quick(self) -> bool:
@@ -85,8 +88,9 @@ class Experiment:
     notes: tuple[str, ...] = field(default=())
 
     def chosen(self, setup: Setup) -> list[Scheme]:
-        """Its schemes, or those of them that the setup names."""
-        return [scheme for scheme in self.schemes(setup) if not setup.only or scheme.name in setup.only]
+        """Its schemes, or those of them that the setup names, and the user's own policies."""
+        named = [scheme for scheme in self.schemes(setup) if not setup.only or scheme.name in setup.only]
+        return [*named, *map(local, setup.policies)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +148,15 @@ def plan(experiment: Experiment, setup: Setup) -> ExperimentPlan:
 def _identity(scheme: Scheme, setup: Setup) -> str | None:
     if isinstance(scheme.decides, OverEdge):
         return setup.llm.identity(scheme.decides.backing)
-    return weights_of(scheme.decides.policy) if isinstance(scheme.decides, Local) else None
+    if not isinstance(scheme.decides, Local):
+        return None
+    policy = scheme.decides.policy
+    return _code_of(policy) if policy in setup.policies else weights_of(policy)
+
+
+def _code_of(policy: str) -> str:
+    """The hash of the file of a user's policy, so that a changed policy flies again."""
+    return sha256(Path(getfile(imported(policy))).read_bytes()).hexdigest()[:16]
 
 
 @cache

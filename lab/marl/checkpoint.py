@@ -67,9 +67,11 @@ class PolicyCheckpoint:
         for name in ("sensors", "uavs", "max_velocity"):
             trained, requested = getattr(self.scenario, name), getattr(scenario, name)
             if trained != requested:
+                preset, changed, _ = scenario.name.partition("_changed_")
+                changes = " with the same --sensors, --uavs and --set" if changed else ""
                 raise CheckpointMismatch(
                     f"{self.scheme} was trained for {name} {trained}, scenario {scenario.name} has {requested}: "
-                    f"train one with `python -m lab train {self.scheme} --scenario {scenario.name}`"
+                    f"train one with `python -m lab train {self.scheme} --scenario {preset}`{changes}"
                 )
         network = network_of(self.scheme, scenario)
         network.load_state_dict(self.weights)

@@ -81,7 +81,7 @@ class KeyAuthentication:
             refusal = problem_response(429, f"key {key.name} has a limit of {key.per_minute} requests a minute")
             refusal.headers["Retry-After"] = str(wait_s)
         elif mission is not None and not key.allows(mission[1]):
-            refusal = refusal_of(no_mission(mission[1]))
+            refusal = refusal_of(no_mission(key, mission[1]))
         else:
             scope[KEY] = key
             scope[STILL_KNOWN] = lambda: (
@@ -104,9 +104,10 @@ class KeyAuthentication:
         return None
 
 
-def no_mission(mission_id: str) -> NotFound:
-    """The refusal of a mission that the request's key is not bound to."""
-    return NotFound("mission_id", f"there is no mission {mission_id}")
+def no_mission(key: ApiKey, mission_id: str) -> NotFound:
+    """The refusal of a mission that the request's key is not bound to, whether or not there is one."""
+    bound = ", ".join(key.missions or ())
+    return NotFound("mission_id", f"there is no mission {mission_id} for key {key.name}, which is bound to {bound}")
 
 
 def _presented(headers: Sequence[tuple[bytes, bytes]]) -> str:

@@ -21,7 +21,9 @@ from service.api.problem_details import documented
 from service.api.routes import TheEngine, may_command, may_know
 from service.errors import NotFound
 from service.live.broadcaster import Broadcaster
+from service.prompting.compact_prompt import in_words
 from shared.wire.missions import DecisionPrompt, MissionLine, MissionList
+from shared.wire.names import with_names
 from shared.wire.reasons import LLM_NOT_ASKED
 from shared.wire.schemas import DecisionId, MissionId
 
@@ -159,13 +161,17 @@ async def get_prompt(mission_id: MissionId, decision_id: DecisionId, engine: The
     decision = engine.live.history.find(mission_id, decision_id)
     if decision is None or decision.prompt is None:
         raise NotFound("decision_id", f"the prompt of decision {decision_id} is unknown or forgotten")
-    prompt = decision.prompt
+    prompt, mission = decision.prompt, await engine.missions.get(mission_id)
+    words = []
+    if mission.spec.prompt.format == "compact":
+        words = in_words(prompt.state, [kept.sensor_id for kept in decision.answer.top_k], mission.scenario)
     return DecisionPrompt(
         decision_id=decision_id,
         asked=decision.answer.reason not in LLM_NOT_ASKED,
         static=prompt.static,
         experiences=prompt.experiences,
         state=prompt.state,
+        in_words=[with_names(line, mission.spec.names) for line in words],
     )
 
 

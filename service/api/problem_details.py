@@ -89,8 +89,9 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def http(_: Request, error: HTTPException) -> Response:
-        faults = [{"field": "body", "problem": str(error.detail)}] if error.status_code == 400 else []
-        response = problem_response(error.status_code, str(error.detail), faults)
+        detail = "is not UTF-8" if isinstance(error.__cause__, UnicodeDecodeError) else str(error.detail)
+        faults = [{"field": "body", "problem": detail}] if error.status_code == 400 else []
+        response = problem_response(error.status_code, f"body: {detail}" if faults else detail, faults)
         response.headers.update(error.headers or {})
         return response
 

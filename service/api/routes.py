@@ -17,7 +17,7 @@ from service.api.authentication import KEY, no_mission
 from service.api.mission_answers import attention_response, status_of
 from service.api.problem_details import documented
 from service.edge.engine import Engine
-from service.live.alarms import KINDS
+from service.live.alarms import KINDS, alarms
 from service.llm.server_pool import ServerPool
 from service.observability.metrics import Metrics
 from shared.planning.guidance_messages import GuidanceAnswer, GuidanceStatus
@@ -94,7 +94,7 @@ def may_know(request: Request, mission_id: str) -> bool:
 
 def _refuse_unless_bound(request: Request, mission_id: str) -> None:
     if not may_know(request, mission_id):
-        raise no_mission(mission_id)
+        raise no_mission(request.scope[KEY], mission_id)
 
 
 def _keys_lost(request: Request) -> bool:
@@ -155,8 +155,11 @@ async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngin
 
 @router.get("/missions/{mission_id}", responses=documented(*_NAMED), tags=["missions"])
 async def get_mission(mission_id: MissionId, engine: TheEngine) -> MissionStatus:
-    """A mission's setup and progress."""
-    return status_of(await engine.missions.get(mission_id))
+    """A mission's setup, progress and alarms."""
+    mission = await engine.missions.get(mission_id)
+    found = alarms(mission, mission.deadlines(), engine.live.watch.of(mission_id).batteries)
+    alarming = {kind: whose for kind, whose in found.items() if whose}
+    return status_of(mission).model_copy(update={"alarms": alarming or None})
 
 
 @router.delete("/missions/{mission_id}", status_code=204, responses=documented(*_NAMED), tags=["missions"])
@@ -182,7 +185,7 @@ async def get_attention(
 @router.get("/missions/{mission_id}/guidance", responses=documented(*_NAMED), tags=["missions"])
 async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStatus:
     """The operator's note, the guidance from it, and its status; only confirmed guidance is obeyed."""
-    return (await engine.missions.get(mission_id)).guidance.report(mission_id)
+    return (await engine.missions.get(mission_id)).report_guidance()
 
 
 @router.post("/missions/{mission_id}/guidance", responses=documented(*_SENT), tags=["missions"])
@@ -197,7 +200,7 @@ async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: The
     engine.compiler.compile(mission)
     engine.live.changed(mission_id)
     await engine.durable("answer", mission)
-    return mission.guidance.report(mission_id)
+    return mission.report_guidance()
 
 
 @router.post("/missions/{mission_id}/readings", responses=documented(*_SENT), tags=["missions"])

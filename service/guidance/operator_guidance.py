@@ -2,17 +2,19 @@
 
 import hashlib
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from datetime import UTC, datetime
 from fnmatch import filter as matching
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import Conflict, Refused
-from shared.planning.guidance_messages import GuidanceAnswer, GuidanceState, GuidanceStatus, OrderRecord
-from shared.planning.orders import NO_GUIDANCE, End, Guidance, Impossible
+from shared.planning.guidance_messages import EndOfOrder, GuidanceAnswer, GuidanceState, GuidanceStatus, OrderRecord
+from shared.planning.orders import NO_GUIDANCE, End, Guidance, Impossible, once
+from shared.wire.names import Names, with_names
 from shared.world.scenario import Scenario
 
 # Most ended orders in memory.
@@ -89,7 +91,7 @@ class OperatorGuidance:
             self._doubts, self._withdrawn = [], []
         elif answer.guidance is not None:
             try:
-                self._change(self._with(answer.guidance, (), replaces, step), step, None)
+                self._change(self._with(answer.guidance, (), replaces, step), step)
             except Impossible as error:
                 raise Refused(f"guidance.{error.field}", error.detail) from None
             self._proposed, self._origin, self._failure = answer.guidance, "operator", None
@@ -126,7 +128,7 @@ class OperatorGuidance:
             or (end.visited is not None and visits[end.visited] >= self._in_force[name].since_step)
         ]
         if over:
-            self._change(self.confirmed.without(over), first, None)
+            self._change(self.confirmed.without(over), first, why="its own end")
         return bool(over)
 
     def _with(self, guidance: Guidance, withdrawn: Sequence[str], replaces: bool, step: int = 0) -> Guidance:
@@ -150,9 +152,9 @@ class OperatorGuidance:
         left = NO_GUIDANCE if names is None else self.confirmed.without(names)
         if self.status == "confirmed" and not left:
             self.status = "rejected"
-        self._change(left, step, None)
+        self._change(left, step, why="withdrawn")
 
-    def _change(self, guidance: Guidance, step: int, note: str | None) -> None:
+    def _change(self, guidance: Guidance, step: int, note: str | None = None, why: EndOfOrder = "replaced") -> None:
         begun, ended = guidance.beyond(self.confirmed), self.confirmed.beyond(guidance)
         if begun or ended:
             self._begun, self._ended = begun, ended
@@ -160,7 +162,7 @@ class OperatorGuidance:
         words = guidance.each_in_words()
         for name, record in list(self._in_force.items()):
             if words.get(name) != record.in_words:
-                over = {"until_step": max(step, record.since_step), "until": now}
+                over = {"until_step": max(step, record.since_step), "until": now, "why": why}
                 self._over.append(self._in_force.pop(name).model_copy(update=over))
         for name, order in words.items():
             if name not in self._in_force:
@@ -183,10 +185,12 @@ class OperatorGuidance:
             return self.orders
         return self._proposed.merged_with(self.confirmed, self._scenario.max_velocity + 1)
 
-    def report(self, mission_id: str) -> GuidanceStatus:
-        """The body of ``GET /missions/{id}/guidance``."""
+    def report(self, mission_id: str, names: Names | None = None) -> GuidanceStatus:
+        """The body of ``GET /missions/{id}/guidance``, with the user's names in the orders' words."""
+        named = partial(with_names, names=names)
         waits = self._proposed if self.status != "confirmed" else None
-        changed = {} if waits is None else self._changes(waits)
+        after = self.confirmed if waits is None else self._after(waits)
+        changed = {} if waits is None else self._changes(waits, after)
         in_words = None if self._proposed is None else self._proposed.in_words()
         if self._withdrawn and not self._proposed:
             in_words = "No new order."
@@ -195,28 +199,40 @@ class OperatorGuidance:
             status=self.status,
             note=self.note,
             guidance=self._proposed,
-            in_words=in_words,
-            obeyed_in_words=None if self.orders is None else self.orders.in_words(),
+            in_words=in_words and named(in_words),
+            obeyed_in_words=None if self.orders is None else named(self.orders.in_words()),
             origin=self._origin,
             model=self._model,
             failure=self._failure,
-            doubts=[*self._doubts, *(["The orders that the note withdraws are not in force."] * self._futile())],
-            **changed,
-            begun=self._begun,
-            ended=self._ended,
-            orders=[*self._over, *self._in_force.values()],
+            doubts=[*self._doubts, *self._doubts_of(after)],
+            **{key: list(map(named, change)) for key, change in changed.items()},
+            begun=list(map(named, self._begun)),
+            ended=list(map(named, self._ended)),
+            orders=[
+                record.model_copy(update={"in_words": named(record.in_words)})
+                for record in (*self._over, *self._in_force.values())
+            ],
             version=self.version,
         )
 
-    def _futile(self) -> bool:
-        return self.status == "proposed" and bool(self._withdrawn) and not self._matching(self._withdrawn)
+    def _doubts_of(self, after: Guidance) -> Iterator[str]:
+        """What code doubts of the orders that are in force after a confirmation."""
+        if self.status == "proposed" and self._withdrawn and not self._matching(self._withdrawn):
+            yield "The orders that the note withdraws are not in force."
+        periods = {f"visit:{wish.sensor_id}": wish.visit_every for wish in after.sensors if wish.visit_every}
+        needed = sum(1 / every for name, every in periods.items() if not once(name, every, after.ends.get(name)))
+        if needed > (uavs := self._scenario.uavs):
+            yield f"The visits need {needed:.1f} UAVs in every step, and there are {uavs}: some will be late."
 
-    def _changes(self, proposed: Guidance) -> dict[str, list[str]]:
-        """What a confirmation would change, each order in words."""
+    def _after(self, proposed: Guidance) -> Guidance:
+        """The orders in force after a confirmation."""
         try:
-            after = self._with(proposed, self._withdrawn, replaces=False)
+            return self._with(proposed, self._withdrawn, replaces=False)
         except Impossible:
-            after = proposed
+            return proposed
+
+    def _changes(self, proposed: Guidance, after: Guidance) -> dict[str, list[str]]:
+        """What a confirmation would change, each order in words."""
         ends = self.confirmed.beyond(after)
         return {
             "begins": proposed.beyond(self.confirmed),

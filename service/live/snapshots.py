@@ -11,7 +11,6 @@ from service.live.fleet_watch import Watched
 from service.live.recent_decisions import RecentDecision
 from service.mission.mission import Mission
 from shared.planning.orders import once
-from shared.wire.names import with_names
 from shared.world.scenario import Scenario
 from shared.world.trajectory import trajectories
 from shared.world.urgency import urgency
@@ -135,18 +134,11 @@ def _uav(mission: Mission, watched: Watched, uav: int) -> dict[str, Any]:
 
 def _guidance(mission: Mission) -> dict[str, Any]:
     """The operator's note, the guidance from it, the orders in force, and the visits that are due, with his names."""
-    visits, confirmed, names = mission.records.visits, mission.guidance.confirmed, mission.spec.names
-    report = mission.guidance.report(mission.mission_id).model_dump(exclude={"mission_id"})
-    words: dict[str, Any] = {}
-    for key in ("in_words", "obeyed_in_words"):
-        words[key] = report[key] and with_names(report[key], names)
-    for key in ("begins", "stays", "ends", "ends_if_replaced", "begun", "ended"):
-        words[key] = [with_names(one, names) for one in report[key]]
-    in_force = [order for order in report["orders"] if order["until"] is None]
+    visits, confirmed = mission.records.visits, mission.guidance.confirmed
+    report = mission.report_guidance().model_dump(exclude={"mission_id"})
     return {
         **report,
-        **words,
-        "orders": [{**order, "in_words": with_names(order["in_words"], names)} for order in in_force],
+        "orders": [order for order in report["orders"] if order["until"] is None],
         "due": [
             {
                 "sensor_id": wish.sensor_id,

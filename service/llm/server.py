@@ -121,8 +121,9 @@ class LlmServer:
     ) -> None:
         self._settings = settings
         self._on_open = on_open
-        self.status = ServerStatus("off" if settings.mode in ("value", "policy") else "loading")
         self.url = settings.llm_url or ""
+        loading = ServerStatus("loading", f"{self.url or 'the embedded LLM'} has not answered yet")
+        self.status = ServerStatus("off") if settings.mode in ("value", "policy") else loading
         self.connection = Connection(settings, warm_up, embed)
         # Brings the server up, or waits for its recovery.
         self._task: asyncio.Task[None] | None = None

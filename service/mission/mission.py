@@ -38,7 +38,7 @@ from service.mission.visit_orders import VisitOrders
 from service.prompting.experiences import Experience, Experiences
 from shared.belief.fleet_belief import FleetBelief, Measured
 from shared.belief.records import Records, take_report
-from shared.planning.guidance_messages import GuidanceAnswer
+from shared.planning.guidance_messages import GuidanceAnswer, GuidanceStatus
 from shared.planning.orders import Guidance
 from shared.wire.missions import VisitDeadline
 from shared.wire.readings import ReadingResult, SensorReading
@@ -116,9 +116,17 @@ class Mission:
         self.record: Callable[[Event], None] = ignore_event
 
     def answer_guidance(self, answer: GuidanceAnswer) -> None:
-        """Apply the operator's answer; raises as :meth:`OperatorGuidance.answer`."""
+        """Apply the operator's answer, in which names stand for IDs too; raises as :meth:`OperatorGuidance.answer`."""
+        if answer.orders and self.spec.names:
+            listed = [(sensor, name) for sensor, name in enumerate(self.spec.names.sensors) if name]
+            ids = {f"{kind}:{name}": f"{kind}:{sensor}" for sensor, name in listed for kind in ("visit", "weight")}
+            answer = answer.model_copy(update={"orders": [ids.get(order, order) for order in answer.orders]})
         self.guidance.answer(answer, self.visit_orders.last + 1)
         self._guidance_changed()
+
+    def report_guidance(self) -> GuidanceStatus:
+        """The body of ``GET /missions/{id}/guidance``, its orders in words with the user's names."""
+        return self.guidance.report(self.mission_id, self.spec.names)
 
     def end_orders(self, step: int) -> None:
         """End the orders whose end has come, before a decision of this step; a replay has the event of it."""

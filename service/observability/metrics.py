@@ -1,7 +1,7 @@
 """Every Prometheus metric of the edge. No label names a mission, UAV or sensor: there are too many of them."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
 
 import numpy as np
@@ -88,88 +88,79 @@ class Metrics:
         ProcessCollector(registry=self.registry)
         PlatformCollector(registry=self.registry)
         r = self.registry
+        self._kinds = partial(Counter, registry=r), partial(Gauge, registry=r), partial(Histogram, registry=r)
+        counter, gauge, histogram = self._kinds
         Info("aicvds_build", "The version of this edge", registry=r).info({"version": version("aic-vds")})
-        self.decisions = Counter("aicvds_decisions", "Decisions answered", ["source", "reason"], registry=r)
-        self.decision_seconds = Histogram(
-            "aicvds_decision_seconds", "Time of a decision by stage", ["stage"], registry=r, buckets=_DECISION_BUCKETS
+        self.decisions = counter("aicvds_decisions", "Decisions answered", ["source", "reason"])
+        self.decision_seconds = histogram(
+            "aicvds_decision_seconds", "Time of a decision by stage", ["stage"], buckets=_DECISION_BUCKETS
         )
-        self.overhead_seconds = Histogram(
-            "aicvds_overhead_seconds",
-            "The edge's own time: all stages but the LLM",
-            registry=r,
-            buckets=_OVERHEAD_BUCKETS,
+        self.overhead_seconds = histogram(
+            "aicvds_overhead_seconds", "The edge's own time: all stages but the LLM", buckets=_OVERHEAD_BUCKETS
         )
         self._add_llm()
-        self.tokens_saved = Counter(
-            "aicvds_tokens_saved", "Tokens saved by attention, masks and short rows", registry=r
-        )
+        self.tokens_saved = counter("aicvds_tokens_saved", "Tokens saved by attention, masks and short rows")
         self._add_outcomes()
-        self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
-        self.tasks = Gauge("aicvds_tasks", "Tasks of the event loop", registry=r)
-        self.alarms = Gauge(
-            "aicvds_alarms", "UAVs and sensors of which a mission's page shows an alarm", ["kind"], registry=r
+        self.deadline_missed = counter("aicvds_deadline_missed", "Decisions answered past their deadline")
+        self.tasks = gauge("aicvds_tasks", "Tasks of the event loop")
+        self.alarms = gauge("aicvds_alarms", "UAVs and sensors of which a mission's page shows an alarm", ["kind"])
+        self.missions = gauge("aicvds_missions", "Missions in memory or in the store")
+        self.store_seconds = histogram(
+            "aicvds_store_seconds", "Time of a commit to the store", buckets=_OVERHEAD_BUCKETS
         )
-        self.missions = Gauge("aicvds_missions", "Missions in memory or in the store", registry=r)
-        self.store_seconds = Histogram(
-            "aicvds_store_seconds", "Time of a commit to the store", registry=r, buckets=_OVERHEAD_BUCKETS
+        self.store_failures = counter("aicvds_store_failures", "Commits that failed; they are tried again")
+        self.leases = gauge("aicvds_leases", "Missions that this edge owns in a shared store")
+        self.leases_taken_over = counter(
+            "aicvds_leases_taken_over", "Missions taken over from another edge, or from an earlier start"
         )
-        self.store_failures = Counter("aicvds_store_failures", "Commits that failed; they are tried again", registry=r)
-        self.leases = Gauge("aicvds_leases", "Missions that this edge owns in a shared store", registry=r)
-        self.leases_taken_over = Counter(
-            "aicvds_leases_taken_over", "Missions taken over from another edge, or from an earlier start", registry=r
-        )
-        self.leases_lost = Counter("aicvds_leases_lost", "Missions that another edge has taken over", registry=r)
+        self.leases_lost = counter("aicvds_leases_lost", "Missions that another edge has taken over")
         # Looking up a child by its labels takes as long as counting; there are few children.
         self._decisions, self._seconds = cache(self.decisions.labels), cache(self.decision_seconds.labels)
         self._tokens = cache(self.llm_tokens.labels)
 
     def _add_llm(self) -> None:
-        r = self.registry
-        self.llm_requests = Counter("aicvds_llm_requests", "Queries to the LLM by outcome", ["outcome"], registry=r)
-        self.llm_breaker_opened = Counter(
-            "aicvds_llm_breaker_opened", "Times that a circuit breaker of an LLM server opened", registry=r
+        counter, gauge, histogram = self._kinds
+        self.llm_requests = counter("aicvds_llm_requests", "Queries to the LLM by outcome", ["outcome"])
+        self.llm_breaker_opened = counter(
+            "aicvds_llm_breaker_opened", "Times that a circuit breaker of an LLM server opened"
         )
-        self.llm_breaker_open = Gauge(
-            "aicvds_llm_breaker_open", "LLM servers whose circuit breaker is open now", registry=r
+        self.llm_breaker_open = gauge("aicvds_llm_breaker_open", "LLM servers whose circuit breaker is open now")
+        self.llm_servers = gauge("aicvds_llm_servers", "LLM servers by state", ["status"])
+        self.llm_tokens = counter("aicvds_llm_tokens", "Tokens that the LLM server reported", ["kind"])
+        self.llm_trust = histogram(
+            "aicvds_llm_trust", "The LLM's weight among mode guided's advisers", buckets=_SHARE_BUCKETS
         )
-        self.llm_servers = Gauge("aicvds_llm_servers", "LLM servers by state", ["status"], registry=r)
-        self.llm_tokens = Counter("aicvds_llm_tokens", "Tokens that the LLM server reported", ["kind"], registry=r)
-        self.llm_trust = Histogram(
-            "aicvds_llm_trust", "The LLM's weight among mode guided's advisers", registry=r, buckets=_SHARE_BUCKETS
+        self.evaluator_timeouts = counter(
+            "aicvds_critic_timeouts", "Decisions of mode guided whose rollout evaluator was late or failed"
         )
-        self.evaluator_timeouts = Counter(
-            "aicvds_critic_timeouts", "Decisions of mode guided whose rollout evaluator was late or failed", registry=r
-        )
-
-        self.keys_lost = Gauge(
-            "aicvds_keys_lost", "Whether the file of API keys cannot be read and the previous keys apply", registry=r
+        self.keys_lost = gauge(
+            "aicvds_keys_lost", "Whether the file of API keys cannot be read and the previous keys apply"
         )
 
     def _add_outcomes(self) -> None:
         """The metrics of outcomes and reports."""
-        r = self.registry
-        self.feedback = Counter("aicvds_feedback", "Outcomes received", ["result"], registry=r)
-        self.costs_clipped = Counter(
-            "aicvds_costs_clipped", "Outcomes whose cost exceeded the largest possible cost of a step", registry=r
+        counter, gauge, histogram = self._kinds
+        self.feedback = counter("aicvds_feedback", "Outcomes received", ["result"])
+        self.costs_clipped = counter(
+            "aicvds_costs_clipped", "Outcomes whose cost exceeded the largest possible cost of a step"
         )
-        self.learner_loss = Gauge("aicvds_learner_loss", "Latest value-regression loss of any mission", registry=r)
+        self.learner_loss = gauge("aicvds_learner_loss", "Latest value-regression loss of any mission")
         self.learner_update_loss = Summary(
-            "aicvds_learner_update_loss", "Value-regression loss of every update", registry=r
+            "aicvds_learner_update_loss", "Value-regression loss of every update", registry=self.registry
         )
-        self.overflow_risk = Histogram(
+        self.overflow_risk = histogram(
             "aicvds_overflow_risk",
             "At each decision, the share of sensors that are expected to overflow before their next visit",
-            registry=r,
             buckets=_SHARE_BUCKETS,
         )
         self.link_excess_db = ArrayHistogram(
             "aicvds_link_excess_db",
             "Path loss measured by beacons minus the formula's, dB",
-            registry=r,
+            registry=self.registry,
             buckets=_EXCESS_BUCKETS_DB,
         )
-        self.radio_failures = Counter("aicvds_radio_failures", "Transmissions that failed over a good link", registry=r)
-        self.readings = Counter("aicvds_readings", "Sensors' own readings by result", ["result"], registry=r)
+        self.radio_failures = counter("aicvds_radio_failures", "Transmissions that failed over a good link")
+        self.readings = counter("aicvds_readings", "Sensors' own readings by result", ["result"])
 
     def record_readings(self, results: Collection[ReadingResult]) -> None:
         """Count sensors' own readings by result."""

@@ -11,7 +11,8 @@ its sensor's sign, by which the model finds the sensor's earlier outcomes. An ad
 that it was trained on: :data:`service.llm.adapter_version.PROMPT_VERSION` changes whenever a text here does.
 """
 
-from collections.abc import Sequence
+import re
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -39,6 +40,7 @@ _SHOWN_STEPS = [0, 1, 3, 7]
 # The sum of urgencies that the digit 9 stands for.
 _MOST_URGENCY = 3.0
 _NINE = 9
+_ROW = re.compile(r"(\d)(\D)(\d{7})(\D)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +118,25 @@ def row_digits(state: State, reach: Reach, outlook: Outlook, scenario: Scenario)
         outlook.others[state.ids],
     )
     return np.stack([digits(column) for column in columns], axis=1)
+
+
+def in_words(text: str, shown: Collection[int], scenario: Scenario) -> list[str]:
+    """What a prompt's digits say: a sentence on the UAV, then on each row of these sensors, in the prompt's order."""
+    capacity, ids = scenario.queue_capacity, {sign(sensor): sensor for sensor in shown}
+    most = {_NINE: "9 or more"}
+    steps, fill = int(text[0]), int(text[1]) / _NINE
+    words = [f"{most.get(steps, steps)} steps are left. The mean queue is {fill:.0%} full."]
+    for queue, own, numbers, letter in _ROW.findall(text[7:]):
+        left, packets, hold, reach, others, slow, fast = map(int, numbers)
+        held, moved = (round(capacity * (int(digit) / _NINE) ** 2) for digit in (queue, packets))
+        slowest, fastest = (round(scenario.max_velocity * digit / _NINE) for digit in (slow, fast))
+        words.append(
+            f"{letter}: sensor {ids.get(own, own)} has about {held} of {capacity} packets and overflows in "
+            f"{most.get(left, left)} steps. The UAV collects up to about {moved} at {slowest} to {fastest} m/s; the "
+            f"link holds with {hold / _NINE:.0%}. The UAV reaches it in {reach} of the next 9 steps, others in "
+            f"{most.get(others, others)}."
+        )
+    return words
 
 
 class CompactTemplate(GuidedTemplate):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
@@ -12,6 +12,7 @@ from shared.wire.strict_models import Received, Wire
 
 # `none`: neither a note nor a structure of the operator's.
 GuidanceState = Literal["none", "compiling", "proposed", "confirmed", "rejected", "failed"]
+EndOfOrder = Literal["its own end", "withdrawn", "replaced"]
 
 
 class OrderRecord(Wire):
@@ -26,6 +27,7 @@ class OrderRecord(Wire):
     since: Clock
     until_step: int | None = Field(None, description="the first step no longer under it; null while it is in force")
     until: Clock | None = None
+    why: EndOfOrder | None = Field(None, description="why it ended; `replaced`: a confirmation contradicted it")
 
 
 class GuidanceStatus(Wire):
@@ -83,8 +85,11 @@ class GuidanceAnswer(Received):
         description="with `guidance` or `confirm`. `add`, the default: the orders in force stay, except those that the "
         "new ones contradict; `replace`: all others end",
     )
-    orders: list[OrderName] | None = Field(
-        None, min_length=1, max_length=MAX_WISHES, description="with `withdraw`: only these end, by name"
+    orders: list[Annotated[str, Field(max_length=80)]] | None = Field(
+        None,
+        min_length=1,
+        max_length=MAX_WISHES,
+        description="with `withdraw`: only these end, by name; `visit:kp-1.58` for the sensor of this name too",
     )
     version: str | None = Field(
         None, max_length=64, description="the status's `version`: the answer gets 409 if the guidance has changed since"

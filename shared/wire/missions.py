@@ -6,7 +6,7 @@ from pydantic import ConfigDict, Field
 
 from shared.wire.names import Names
 from shared.wire.schemas import Belief, DecisionId, Features, Init, MissionId, Mode, PromptStyle
-from shared.wire.strict_models import Wire
+from shared.wire.strict_models import Wire, omitted
 from shared.world.scenario import Scenario
 
 
@@ -67,26 +67,18 @@ class MissionStatus(Wire):
     learner_loss: float | None
     visits: dict[int, int] = Field(description="sensor: step of the last visit")
     # Omitted where there is none: an older client refuses fields that it does not know.
-    learned: LearnedWorld | None = Field(
-        None,
-        exclude_if=lambda value: value is None,
-        description="how the world differs from the scenario's formulas; omitted without evidence that it does",
+    learned: LearnedWorld | None = omitted(
+        "how the world differs from the scenario's formulas; omitted without evidence that it does"
     )
-    deadlines: list[VisitDeadline] | None = Field(
-        None,
-        exclude_if=lambda value: value is None,
-        description="the orders to visit sensors, ended ones first, at most 100 of these; omitted where none was given",
+    deadlines: list[VisitDeadline] | None = omitted(
+        "the orders to visit sensors, ended ones first, at most 100 of these; omitted where none was given"
     )
-    readings: int | None = Field(
-        None,
-        exclude_if=lambda value: value is None,
-        description="sensors' own readings that changed the belief; omitted where there was none",
+    readings: int | None = omitted("sensors' own readings that changed the belief; omitted where there was none")
+    alarms: dict[str, dict[int, int | None]] | None = omitted(
+        "in `GET`: `uav_lost`, `uav_off_path`, `uav_battery`, `visit_late` or `sensor_battery`, each with "
+        "the UAVs' or sensors' IDs and the step since when, null if unknown; omitted without an alarm"
     )
-    names: Names | None = Field(
-        None,
-        exclude_if=lambda value: value is None,
-        description="the user's names of sensors and UAVs; omitted where none were given",
-    )
+    names: Names | None = omitted("the user's names of sensors and UAVs; omitted where none were given")
 
 
 class WeightArray(Wire):
@@ -140,3 +132,4 @@ class DecisionPrompt(Wire):
     static: str
     experiences: str
     state: str
+    in_words: list[str] = Field([], description="what the digits of a compact prompt's `state` say, a line a row")

@@ -35,11 +35,11 @@ MapShapes = Annotated[list[MapShape], Field(max_length=MAX_SHAPES, fail_fast=Tru
 
 
 def with_names(text: str, names: Names | None) -> str:
-    """A text with the user's name after each ``sensor 4`` and ``UAV 1`` that has one."""
+    """A text with the user's name after each ``sensor 4`` and ``UAV 1`` that has one and is without it."""
 
     def named(found: re.Match[str]) -> str:
         listed = () if names is None else names.uavs if found[1] == "UAV" else names.sensors
         name = listed[number] if (number := int(found[2])) < len(listed) else None
         return found[0] if name is None else f"{found[0]} ({name})"
 
-    return re.sub(r"\b(UAV|[Ss]ensor) (\d{1,4})\b", named, text)
+    return re.sub(r"\b(UAV|[Ss]ensor) (\d{1,4})\b(?! \()", named, text)

@@ -1,6 +1,8 @@
 """Errors on the wire: the body of every answer of the edge outside 2xx."""
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
+
+from shared.wire.strict_models import omitted
 
 # The type of a problem with an omitted part of a report that the edge does not have: the client is to send all of it.
 INCOMPLETE = "urn:aicvds:problem:incomplete"
@@ -21,8 +23,6 @@ class Problem(BaseModel):
     status: int
     detail: str
     errors: list[Fault] = []
-    owner: str | None = Field(
-        None,
-        exclude_if=lambda value: value is None,
-        description="of a 421: the URL of the edge that has the mission; the header Location has the whole address",
+    owner: str | None = omitted(
+        "of a 421: the URL of the edge that has the mission; the header Location has the whole address"
     )

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, ValidationInfo, field_validator, mod
 from shared.wire.names import MapShapes, Names
 from shared.wire.problem import INCOMPLETE
 from shared.wire.reasons import Reason
-from shared.wire.strict_models import Received, Wire, one_paragraph
+from shared.wire.strict_models import Received, Wire, omitted, one_paragraph
 from shared.world.scenario import MAX_SENSORS, Scenario
 
 MAX_STEP = 1_000_000
@@ -97,13 +97,11 @@ class Outcome(Received):
     cost: float = Field(ge=0, le=10_000, description="c, 0 is best; the value regression's target is -c")
     failed: bool = Field(False, description="the transmission failed (f = 1)")
     # Omitted if not set, so that a request repeated after an upgrade is still the same request.
-    round_trip_ms: float | None = Field(
-        None,
+    round_trip_ms: float | None = omitted(
+        "from the request for that decision to its answer, measured by the UAV, retries included; the "
+        "mission page shows it, and nothing learns from it",
         ge=0,
         le=MAX_ROUND_TRIP_MS,
-        exclude_if=lambda value: value is None,
-        description="from the request for that decision to its answer, measured by the UAV, retries included; the "
-        "mission page shows it, and nothing learns from it",
     )
 
 
@@ -116,40 +114,24 @@ class UavState(Received):
         None, ge=0, le=1e9, description="m along its trajectory, from its first waypoint (a circle's: due east)"
     )
     # All of these are omitted if not set, for the same reason as an outcome's round trip.
-    battery_percent: float | None = Field(
-        None,
-        ge=0,
-        le=100,
-        exclude_if=lambda value: value is None,
-        description="of the UAV's own battery; for the page and its alarm, nothing else uses it",
+    battery_percent: float | None = omitted(
+        "of the UAV's own battery; for the page and its alarm, nothing else uses it", ge=0, le=100
     )
-    height_m: float | None = Field(
-        None,
-        ge=-1000,
-        le=1e5,
-        exclude_if=lambda value: value is None,
-        description="m above the take-off place, for the page only",
-    )
-    top_speed_mps: float | None = Field(
-        None,
+    height_m: float | None = omitted("m above the take-off place, for the page only", ge=-1000, le=1e5)
+    top_speed_mps: float | None = omitted(
+        "the ground speed that it has not exceeded though it was commanded more: the edge decides on no "
+        "higher velocity, to the nearest m/s, where the operator's orders allow that",
         gt=0,
         le=1000,
-        exclude_if=lambda value: value is None,
-        description="the ground speed that it has not exceeded though it was commanded more: the edge decides on no "
-        "higher velocity, to the nearest m/s, where the operator's orders allow that",
     )
-    base: DecisionId | None = Field(
-        None,
-        exclude_if=lambda value: value is None,
-        description="this UAV's last decision in this mission: `sensors` then has only the rows that differ from the "
+    base: DecisionId | None = omitted(
+        "this UAV's last decision in this mission: `sensors` then has only the rows that differ from the "
         "report which that decision answered, if any. 409 of type `" + INCOMPLETE + "` if the edge "
-        "does not have that report (any more): send the whole report",
+        "does not have that report (any more): send the whole report"
     )
-    uplink: Literal["delta"] | None = Field(
-        None,
-        exclude_if=lambda value: value is None,
-        description="`delta`: the edge is to keep this report, so that the UAV's next report may name the decision as "
-        "its `base`; a `base` implies `delta`",
+    uplink: Literal["delta"] | None = omitted(
+        "`delta`: the edge is to keep this report, so that the UAV's next report may name the decision as "
+        "its `base`; a `base` implies `delta`"
     )
     sensors: SensorColumns
     outcome: Outcome | None = Field(None, description="of this UAV's previous decision")
@@ -355,16 +337,8 @@ class MissionSpec(Received):
         description="the operator's note in plain words, such as `suspected leak at sensor 4: visit it every third "
         "step`",
     )
-    names: Names | None = Field(
-        None,
-        exclude_if=lambda value: value is None,
-        description="the user's names of sensors and UAVs: on the page, and for notes",
-    )
-    map: MapShapes | None = Field(
-        None,
-        exclude_if=lambda value: value is None,
-        description="lines and areas behind the page's map; notes may use their names",
-    )
+    names: Names | None = omitted("the user's names of sensors and UAVs: on the page, and for notes")
+    map: MapShapes | None = omitted("lines and areas behind the page's map; notes may use their names")
 
 
 class Readiness(Wire):

@@ -1,6 +1,8 @@
 """The bases of the wire's models, and a check of texts."""
 
-from pydantic import BaseModel, ConfigDict, model_validator
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from shared.kit.received_objects import few_names, plain
 
@@ -27,3 +29,8 @@ def one_paragraph(text: str) -> str:
     if not text.isprintable() or not text.strip():
         raise ValueError("must be one paragraph of printable characters, without line breaks or control characters")
     return text
+
+
+def omitted(description: str, **bounds: Any) -> Any:
+    """A field that is left out where it is None: an older client refuses fields that it does not know."""
+    return Field(None, exclude_if=lambda value: value is None, description=description, **bounds)

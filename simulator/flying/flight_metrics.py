@@ -36,12 +36,8 @@ class FlightMetrics:
         self.registry = r = CollectorRegistry()
         ProcessCollector(registry=r)
         self._decisions = Counter("aicvds_flight_decisions", "Decisions flown", ["source", "reason"], registry=r)
-        self._round_trip = Histogram(
-            "aicvds_flight_round_trip_seconds",
-            "Time from a UAV's first attempt to the edge's answer, retries included",
-            registry=r,
-            buckets=_ROUND_TRIP_BUCKETS,
-        )
+        text = "Time from a UAV's first attempt to the edge's answer, retries included"
+        self._round_trip = Histogram("aicvds_flight_round_trip_seconds", text, registry=r, buckets=_ROUND_TRIP_BUCKETS)
         self._lost = Counter("aicvds_flight_lost_packets", "Packets that full queues lost", registry=r)
         self._overflows = Counter("aicvds_flight_overflows", "Queues that overflowed, each step anew", registry=r)
         self._collected = Counter("aicvds_flight_collected_packets", "Packets that UAVs collected", registry=r)

@@ -130,7 +130,7 @@ def orders_text(summary: Summary) -> str | None:
     if not summary.operator.in_force:
         return "No order of the operator was in force: none was confirmed."
     orders = " ".join(dict.fromkeys(order.in_words for order in summary.operator.in_force))
-    return f"The fleet obeyed the operator's orders, which may cost packets: {orders}"
+    return f"Orders of the operator were in force, which may cost packets: {orders}"
 
 
 def late_text(summary: Summary) -> str | None:

@@ -9,13 +9,14 @@ import sys
 import unicodedata
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 
+from lab.experiments.result import Result
 from tests.conftest import Edge
 from tests.support.places import ROOT
+from tests.support.processes import run_lab_here
 
 # Where a reader is led, not what a page loads.
 LINKS = re.compile(r"<a [^>]*>")
@@ -135,10 +136,19 @@ def blocks(page: str) -> str:
     return "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
 
 
-def test_the_policy_shown_flies(capsys: pytest.CaptureFixture[str]) -> None:
-    names: dict[str, Any] = {}
-    exec(blocks("docs/guides/policy.md").replace("range(5)", "range(1)"), names)
-    assert re.match(r"mine \[\d+\]\neof \[\d+\]\n$", capsys.readouterr().out)
+def test_the_policy_shown_flies_beside_shipped_ones(tmp_path: Path) -> None:
+    policy = tmp_path / "fullest.py"
+    policy.write_text(blocks("docs/guides/policy.md"), encoding="utf-8")
+    own = f"{policy}:FullestInRange"
+    args = ["experiment", "scheduler", "--llm", "none", "--scheme", "eof", "--seeds", "2", "--out", str(tmp_path)]
+    assert run_lab_here(*args, "--policy", own).returncode == 0
+    result = Result.model_validate_json((tmp_path / "scheduler" / "results.json").read_bytes())
+    assert result.seeds_of.get(own, result.seeds) == [0, 1] and result.schemes.keys() == {"eof", own}
+    flown = set(tmp_path.glob("flights/*"))
+    # A changed policy flies again, the other scheme does not.
+    policy.write_text(policy.read_text(encoding="utf-8").replace("min(10,", "min(9,"), encoding="utf-8")
+    assert run_lab_here(*args, "--policy", own).returncode == 0
+    assert len(set(tmp_path.glob("flights/*")) - flown) == 2
 
 
 def test_the_client_shown_asks(edge: Edge, capsys: pytest.CaptureFixture[str]) -> None:

@@ -74,7 +74,8 @@ async function showPrompt(answer, section) {
     const told = await ask(path);
     const block = (name, text) => [make("h4", {}, name), make("pre", { tabindex: 0, role: "region", "aria-label": name }, text || "(empty)")];
     parts = [make("p", { class: "hint" }, told.asked ? "As the LLM received it." : "No LLM was asked. The prompt only serves to count its tokens."),
-      ...block("Static block, the same for the whole mission", told.static), ...block("Experiences", told.experiences), ...block("Current task", told.state)];
+      ...block("Static block, the same for the whole mission", told.static), ...block("Experiences", told.experiences), ...block("Current task", told.state),
+      ...(told.in_words.length ? block("Current task in words", told.in_words.join("\n")) : [])];
   } catch (error) {
     const gone = error instanceof Refused && error.status === 404;
     parts = [make("p", {}, gone ? "The edge keeps the prompts of its newest decisions only; this one is gone." : `The edge did not say: ${error.message}`)];

@@ -128,6 +128,9 @@ def test_mode_guided_shows_candidates_with_probabilities_and_trust(visit: Open, 
         expect(dialog.locator("tbody tr").first).to_contain_text(f"{best['llm']:.3f}{best['mixture']:.3f}")
         expect(dialog.locator("meter")).to_have_count(len(answer["guided"]["trust"]))
         expect(dialog).to_contain_text("As the LLM received it.")
+        # A row of the digits is a sentence for each.
+        words = dialog.get_by_role("region", name="Current task in words")
+        expect(words).to_contain_text(re.compile(r"A: sensor \d has about \d+ of 60 packets and overflows in"))
         expect(dialog.get_by_role("heading", name="Tokens")).to_be_visible()
         expect(page.locator("#tokens canvas")).to_have_count(1)
         assert violations(page) == []

@@ -73,6 +73,8 @@ def test_help_tells_what_every_experiment_is() -> None:
         (["aoi", "--edge", "nowhere"], "--edge"),
         (["aoi", "--scenario", "mars"], "--scenario"),
         (["llm-models", "--model", "/no/such.gguf"], "--model /no/such.gguf"),
+        (["scheduler", "--policy", "eof"], "write MODULE:CLASS or FILE.py:CLASS; --scheme names a shipped one"),
+        (["scheduler", "--policy", "no_such.py:Mine"], "there is no file no_such.py"),
         (["aoi", "--scheme", "eoff"], "not 'eoff'; did you mean eof?"),
         (["top-k", "--llm", "none"], "top-k: every scheme of it asks an LLM"),
     ],

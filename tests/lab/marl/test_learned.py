@@ -80,6 +80,10 @@ def test_the_error_for_another_size_names_the_training_command() -> None:
     with pytest.raises(ValueError, match=message) as refused:
         policy.reset(SCENARIOS["dense"], 0)
     assert isinstance(refused.value, UsageError), "a command shows it as one line"
+    # A changed scenario's name is no preset's.
+    changed = SCENARIOS["dense"].model_copy(update={"name": "dense_changed_1a2b3c"})
+    with pytest.raises(ValueError, match="--scenario dense` with the same --sensors"):
+        policy.reset(changed, 0)
 
 
 def test_weights_of_ones_own_fly_the_scenario_they_were_trained_in(tmp_path: Path) -> None:

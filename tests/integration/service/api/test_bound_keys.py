@@ -164,6 +164,13 @@ def test_every_route_scope_and_binding(flown: Any, keys: Any, route: str, bindin
                 client.put(f"/missions/{mission}", json={}, headers=operator).raise_for_status()
 
 
+def test_the_refusal_says_what_the_key_is_bound_to(flown: Any, keys: Any) -> None:
+    client, _ = flown
+    refused = client.put(f"/missions/{ABSENT}", json={}, headers=bearer(keys[1]["both", frozenset({"admin"})]))
+    said = f"there is no mission {ABSENT} for key both-admin, which is bound to x, north-*"
+    assert (refused.status_code, said in refused.json()["detail"]) == (404, True)
+
+
 @pytest.mark.parametrize(
     ("binding", "listed"),
     [("operator", [FOREIGN, MINE]), ("prefix", [MINE]), ("name", [MINE]), ("both", [MINE]), ("other", [])],

@@ -201,6 +201,7 @@ def test_bodies_that_are_no_json(edge: Edge, body: bytes) -> None:
     response = edge().post("/decide", content=body, headers={"content-type": "application/json"})
     assert response.status_code in (400, 422), response.text
     assert fields(response) == ["body"]
+    assert ("is not UTF-8" in response.json()["detail"]) == (body == b"\xff")
 
 
 def test_a_cut_upload_is_not_recorded(edge: Edge, report: Report) -> None:

@@ -62,6 +62,57 @@ def test_one_order_is_withdrawn_by_its_name(edge: Edge, report: Report) -> None:
     assert say(client, answer="withdraw", orders=["visit:4"])["status"] == "rejected"
 
 
+def test_orders_are_said_and_withdrawn_by_the_users_names_too(edge: Edge) -> None:
+    client = edge()
+    client.put("/missions/test", json={"names": {"sensors": ["a", "b", None, "c", "kp-1.58"]}})
+    named = VISIT.replace("sensor 4", "sensor 4 (kp-1.58)")
+    assert say(client, guidance=LEAK)["obeyed_in_words"] == f"{named}."
+    told = say(client, answer="withdraw", orders=["visit:kp-1.58"])
+    assert (told["obeyed_in_words"], told["ended"]) == (None, [f"{named}."])
+    assert [(order["name"], order["in_words"]) for order in told["orders"]] == [("visit:4", f"{named}.")]
+
+
+def test_an_ended_order_says_why(edge: Edge, report: Report) -> None:
+    client = edge()
+    client.put("/missions/test", json={})
+    say(client, guidance={**ended(step=1), "min_velocity": 1})
+    client.post("/decide", json=report(step=1))
+    say(client, guidance={"min_velocity": 2})
+    told = say(client, answer="withdraw")
+    reasons = {(order["name"], order["in_words"][-6:]): order["why"] for order in told["orders"]}
+    assert reasons == {
+        ("max_velocity", "tep 1."): "its own end",
+        ("min_velocity", " 1 m/s."[-6:]): "replaced",
+        ("min_velocity", " 2 m/s."[-6:]): "withdrawn",
+        ("visit:4", "steps."): "withdrawn",
+    }
+
+
+def test_visits_that_need_more_uavs_than_there_are_are_doubted(edge: Edge) -> None:
+    client = edge()
+    client.put("/missions/test", json={})
+    every = [{"sensor_id": sensor, "visit_every": 2} for sensor in range(7)]
+    assert say(client, guidance={"sensors": every[:6]})["doubts"] == []
+    doubts = ["The visits need 3.5 UAVs in every step, and there are 3: some will be late."]
+    assert say(client, guidance={"sensors": every})["doubts"] == doubts
+    # One visit each is no interval.
+    ends = {f"visit:{sensor}": {"visited": sensor} for sensor in range(7)}
+    once = [{"sensor_id": sensor, "visit_every": 1} for sensor in range(7)]
+    assert say(client, guidance={"sensors": once, "ends": ends})["doubts"] == []
+
+
+def test_a_late_visit_is_an_alarm_of_the_mission(edge: Edge, report: Report) -> None:
+    client = edge()
+    client.put("/missions/test", json={})
+    say(client, guidance={"sensors": [{"sensor_id": 4, "visit_every": 3}]})
+    client.post("/decide", json=report(step=0))
+    assert "alarms" not in client.get("/missions/test").json()
+    for step in range(1, 8):
+        decision = client.post("/decide", json=report(step=step)).json()
+        client.post("/feedback", json={"decision_id": decision["decision_id"], "cost": 0.0, "failed": True})
+    assert client.get("/missions/test").json()["alarms"]["visit_late"] == {"4": 2}
+
+
 @pytest.mark.parametrize("end", [{"step": 3}, {"steps": 3}])
 def test_an_order_ends_at_its_step(edge: Edge, report: Report, end: dict[str, Any]) -> None:
     client = edge()

@@ -98,3 +98,21 @@ def test_what_is_not_understood_says_so_and_changes_nothing(client: httpx.Client
     told = read(client, note, LEAK)
     assert (told["status"], told["obeyed_in_words"]) == ("failed", VISIT)
     assert "unclear" in told["failure"]
+
+
+@pytest.mark.parametrize(
+    "note",
+    [
+        "The leak at sensor 4 was a false alarm, we can stop checking it. Keep an eye on everything around the valve "
+        "station instead.",
+        "The 9 m/s cap is off, go as you please.",
+        "The 3 m/s minimum is off, hover if you like.",
+        "Sensor 4 is fixed, no longer every 3 steps.",
+        "Ease off on sensor 4, every 3 steps was too much.",
+    ],
+)
+def test_no_note_begins_the_opposite_of_what_it_says(client: httpx.Client, note: str) -> None:
+    told = read(client, note, LEAK_AND_LIMIT)
+    assert told["begins"] == [], told
+    # It ends the order, or is refused, or says that nothing new would begin.
+    assert told["status"] == "failed" or told["ends"] or any("In force already" in doubt for doubt in told["doubts"])

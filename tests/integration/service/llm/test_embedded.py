@@ -145,7 +145,8 @@ def test_decisions_and_health_go_on_while_the_model_loads(report: Report, monkey
     with serving(app) as url, httpx.Client(base_url=url, timeout=PATIENCE_S) as client, gate:
         until(lambda: gate.came)
         assert client.get("/healthz").status_code == 200
-        assert client.get("/readyz").json()["llm"] == "loading"
+        told = client.get("/readyz").json()
+        assert (told["llm"], told["detail"]) == ("loading", "the embedded LLM has not answered yet")
         assert client.post("/decide", json=report(mission_id="early")).json()["reason"] == "llm_loading"
         gate.open()
         wait_for(client, "ready")

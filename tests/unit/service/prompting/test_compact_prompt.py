@@ -14,7 +14,7 @@ from service.deciding.deliberation import candidates_of, template_of
 from service.errors import Refused
 from service.mission.mission import Mission
 from service.prompting.candidates import Viewpoint
-from service.prompting.compact_prompt import SIGNS, CompactTemplate, Outlook, digits, sign
+from service.prompting.compact_prompt import SIGNS, CompactTemplate, Outlook, digits, in_words, sign
 from service.prompting.experiences import Experience
 from shared.wire.schemas import MissionSpec
 from shared.world.scenario import SCENARIOS, Scenario
@@ -102,6 +102,31 @@ def test_a_row_shows_the_queue_and_what_can_be_collected() -> None:
         queue, packets = state.state.queue[shown], state.reach.best_packets[shown]
         assert int(row[0]) == round(9 * (queue / PAPER.queue_capacity) ** 0.5)
         assert int(row[2]) == round(9 * (packets / PAPER.queue_capacity) ** 0.5)
+
+
+def test_the_digits_are_told_in_words() -> None:
+    sensors = SCENARIOS["pipeline"].sensors
+    text = f"340000U8{sign(2)}3692140E9{sign(sensors - 1)}9109909A"
+    assert in_words(text, range(sensors), PAPER) == [
+        "3 steps are left. The mean queue is 44% full.",
+        "E: sensor 2 has about 47 of 60 packets and overflows in 3 steps. The UAV collects up to about 27 at 6 to 0 "
+        "m/s; the link holds with 100%. The UAV reaches it in 2 of the next 9 steps, others in 1.",
+        f"A: sensor {sensors - 1} has about 60 of 60 packets and overflows in 9 or more steps. The UAV collects up to "
+        "about 1 at 0 to 14 m/s; the link holds with 0%. The UAV reaches it in 9 of the next 9 steps, others in 9 or "
+        "more.",
+    ]
+
+
+@pytest.mark.parametrize("name", ["paper", "stress", "pipeline"])
+def test_the_words_are_those_of_the_digits(name: str) -> None:
+    mission, state = flown(SCENARIOS[name], 3)
+    text, scenario = candidates_of(state, template_of(mission)).rows, mission.scenario
+    words = in_words(text, state.state.ids.tolist(), scenario)
+    assert len(words) == 1 + len(text[7:]) // 10
+    for line, row in zip(words[1:], re.findall(".{10}", text[7:]), strict=True):
+        found = re.match(r"(.): sensor (\d+) has about (\d+) of", line)
+        assert found is not None and found[1] == row[-1] and sign(int(found[2])) == row[1]
+        assert digits(9 * np.sqrt(int(found[3]) / scenario.queue_capacity)) == int(row[0])
 
 
 def test_an_outlook_counts_the_steps_in_reach() -> None:

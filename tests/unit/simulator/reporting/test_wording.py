@@ -114,7 +114,7 @@ def test_the_operators_orders_are_named_beside_the_losses(flight: Flight) -> Non
     said = orders_text(summary.model_copy(update={"operator": unconfirmed}))
     assert said is not None and said.startswith("No order of the operator was in force")
     said = orders_text(summary.model_copy(update={"operator": obeyed}))
-    assert said == "The fleet obeyed the operator's orders, which may cost packets: Visit sensor 3."
+    assert said == "Orders of the operator were in force, which may cost packets: Visit sensor 3."
 
 
 def guided(**changes: object) -> Summary:
