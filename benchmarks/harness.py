@@ -10,6 +10,7 @@ import inspect
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 import tempfile
@@ -92,6 +93,15 @@ class Server:
     def resident_bytes(self) -> int:
         """Resident bytes of the process and of those that it started."""
         return sum(each.memory_info().rss for each in (self.process, *self.process.children()))
+
+    def resident_parts(self) -> dict[str, int]:
+        """The same by part: what the process and its store's writer allocate, and pages of files and shared memory."""
+        parts = dict.fromkeys(("edge", "writer", "files"), 0)
+        for at, each in enumerate((self.process, *self.process.children())):
+            status = Path(f"/proc/{each.pid}/status").read_text(encoding="ascii")
+            for kind, kilobytes in re.findall(r"^Rss(Anon|File|Shmem):\s+(\d+) kB", status, re.MULTILINE):
+                parts["files" if kind != "Anon" else "writer" if at else "edge"] += 1024 * int(kilobytes)
+        return parts
 
 
 Asked = TypeVar("Asked", bound=Options)

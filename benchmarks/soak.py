@@ -81,6 +81,7 @@ class Sample:
 
     at_s: float
     resident_mb: float
+    parts_mb: dict[str, float]
     tasks: float
     connections: int
     files: int
@@ -133,6 +134,7 @@ def sample(edge: Server, began: float) -> Sample:
     return Sample(
         at_s=time.monotonic() - began,
         resident_mb=edge.resident_bytes() / 1e6,
+        parts_mb={name: part / 1e6 for name, part in edge.resident_parts().items()},
         tasks=metric(edge, "aicvds_tasks"),
         connections=len(edge.process.net_connections("tcp")),
         files=edge.process.num_fds(),
@@ -169,6 +171,10 @@ def measure(options: Soak) -> Report:
         "lost": lost,
         "unstored": sum(mission.unstored for mission in missions),
         "resident_mb": [round(samples[0].resident_mb, 1), round(samples[-1].resident_mb, 1)],
+        "resident_parts_mb": {
+            name: [round(samples[at].parts_mb[name], 1) for at in (0, len(samples) // 2, -1)]
+            for name in samples[0].parts_mb
+        },
         "slope_mb_an_hour": [round(value, 2) for value in (grown, grown - half, grown + half)],
     }
     goals = [Goal("memory, MB an hour, lower bound", grown - half, most=1.0)]
