@@ -11,14 +11,13 @@ from service.live.fleet_watch import Watched
 from service.live.recent_decisions import RecentDecision
 from service.mission.mission import Mission
 from shared.planning.orders import once
-from shared.world.scenario import Scenario
 from shared.world.trajectory import trajectories
 from shared.world.urgency import urgency
 
 # The most steps until a queue is full, for a sensor with hardly any arrivals.
 _NEVER = 10_000
-# Points of a trajectory. The error for a circle of 300 m is less than half a metre.
-_POINTS = 97
+# Where along a trajectory its points are. The error for a circle of 300 m is less than half a metre.
+_SHARES = np.linspace(0.0, 1.0, 97)
 
 
 def snapshot(mission: Mission, decisions: list[RecentDecision], watched: Watched, edge: str) -> bytes:
@@ -41,7 +40,7 @@ def snapshot(mission: Mission, decisions: list[RecentDecision], watched: Watched
             },
             "scenario": scenario.model_dump(include=_SHOWN),
             "pipeline": scenario.pipeline if scenario.layout != "uniform" else (),
-            "trajectories": _curves(scenario),
+            "trajectories": [t.at(_SHARES * t.length_m).round(1).tolist() for t in trajectories(scenario)],
             "places": np.round(mission.places, 1).tolist(),
             "names": mission.spec.names,
             "map": mission.spec.map or (),
@@ -150,10 +149,6 @@ def _guidance(mission: Mission) -> dict[str, Any]:
             and not once(name := f"visit:{wish.sensor_id}", wish.visit_every, confirmed.ends.get(name))
         ],
     }
-
-
-def _curves(scenario: Scenario) -> list[Any]:
-    return [np.round(t.at(np.linspace(0.0, t.length_m, _POINTS)), 1).tolist() for t in trajectories(scenario)]
 
 
 def _json(value: dict[str, Any]) -> bytes:

@@ -1,10 +1,9 @@
 """The connection to one LLM server or to the embedded LLM: its client, its model's names and its abilities."""
 
 import asyncio
-import importlib
 import logging
 from dataclasses import replace
-from types import ModuleType
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from service.config.settings import Settings
@@ -72,7 +71,8 @@ class Connection:
             NoDecision, TimeoutError: no server answers.
             ModelMissing, AdapterUnusable, LoadFailed: there is no embedded LLM.
         """
-        settings, client_module = self._settings, await asyncio.to_thread(_client_module)
+        # In a thread: importing aiohttp takes a fifth of a second.
+        settings, client_module = self._settings, await asyncio.to_thread(import_module, "service.llm.client")
         if self.client is None and settings.llm_url is not None:
             self.client = client_module.client_of(settings)
         elif self.client is None:
@@ -141,8 +141,3 @@ class Connection:
         if self.client is None:
             raise NoDecision("llm_unavailable", "the LLM is not reached yet")
         return self.client
-
-
-def _client_module() -> ModuleType:
-    """The client's module, imported in a thread: importing aiohttp takes a fifth of a second."""
-    return importlib.import_module("service.llm.client")

@@ -106,7 +106,8 @@ class Reports:
             positions = positions.copy()
             positions[changed.id] = np.stack((changed.x, changed.y), axis=1)
         x, y = _positions_of(ids, positions, at)
-        queue, battery, gain, seen = (_nullable(column) for column in columns[1:])
+        known = ([None if value != value else value for value in column.tolist()] for column in columns[1:])
+        queue, battery, gain, seen = known
         # Validation is skipped: each number passed it when its report arrived.
         whole = SensorColumns.model_construct(
             id=ids.tolist(),
@@ -192,7 +193,3 @@ def _positions_of(ids: NDArray[np.int64], positions: FloatArray, at: str) -> Flo
     if (unknown := np.flatnonzero(np.isnan(found[0]))).size:
         raise Incomplete(f"{at}sensors.x", f"the position of sensor {ids[unknown[0]]} is unknown: send x and y")
     return found
-
-
-def _nullable(column: FloatArray) -> list[float | None]:
-    return [None if value != value else value for value in column.tolist()]

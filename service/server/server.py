@@ -4,10 +4,13 @@ import asyncio
 import ctypes
 import logging
 import math
+import os
 import resource
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import uvicorn
@@ -261,13 +264,25 @@ class Server(uvicorn.Server):
 
     async def _stop_accepting(self, sockets: list[socket.socket]) -> None:
         """Accept the clients that have connected, and wait for their requests: uvicorn would drop them."""
-        for _ in range(3):
-            await asyncio.sleep(0)
+        state = {"server_state": self.server_state, "app_state": self.lifespan.state}
+        protocol = partial(BoundedHttpProtocol, config=self.config, **state)
+        # Nothing runs between the last client and the close, or the system would reset those that come meanwhile.
+        own = [listening.fileno() for server in self.servers for listening in server.sockets]
+        clients = [client for listening in own for client in waiting_clients(listening)]
         for server in self.servers:
             server.close()
         for listening in sockets:
             listening.close()
+        for client in clients:
+            await asyncio.get_running_loop().connect_accepted_socket(protocol, client)
         await asyncio.sleep(_ARRIVING_S)
+
+
+def waiting_clients(listening: int) -> Iterator[socket.socket]:
+    """Accept the clients that wait at a listening socket that does not block."""
+    with socket.socket(fileno=os.dup(listening)) as waiting, suppress(BlockingIOError):
+        while True:
+            yield waiting.accept()[0]
 
 
 def hand_back_memory() -> None:

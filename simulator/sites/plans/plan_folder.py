@@ -53,7 +53,8 @@ def import_plans(plans: Sequence[Path], folder: Path, overwrite: bool) -> Import
         fences += there.fences.values()
     kept = [feature for feature in document["features"] if feature["properties"]["role"] != "trajectory"]
     drawn = _further_fences(plans, read, path, fences)
-    flown = [_trajectory_feature(plan, of.stem) for plan, of in zip(read, plans, strict=True)]
+    paths = ([list(point) for point in plan.path.trajectory] for plan in read)
+    flown = [_feature("trajectory", "LineString", p, name=of.stem) for p, of in zip(paths, plans, strict=True)]
     document |= {"features": [*kept, *flown, *map(_fence_feature, drawn)]}
     survey = survey_of(path, document)
     if survey.sensors:
@@ -112,10 +113,6 @@ def _same(one: Fence, other: Fence) -> bool:
     if (one.role, len(one.points)) != (other.role, len(other.points)) or abs(one.radius - other.radius) > 0.01:
         return False
     return bool(np.allclose(one.points, other.points, rtol=0.0, atol=2e-7))
-
-
-def _trajectory_feature(plan: FlightPlan, name: str) -> dict[str, Any]:
-    return _feature("trajectory", "LineString", [list(point) for point in plan.path.trajectory], name=name)
 
 
 def _fence_feature(fence: Fence) -> dict[str, Any]:
