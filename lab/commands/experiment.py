@@ -22,7 +22,6 @@ from shared.kit.validation_messages import suggestion
 from simulator.commands.options import check_between, edge_from_option, site_from_options
 from simulator.commands.running import command_main
 from simulator.errors import UsageError
-from simulator.policies.registry import policy_named
 
 SEEDS, LLM_SEEDS = 30, 10
 PAGE, MAP, FIGURES = "page", "claims-map", "paper-figures"
@@ -145,6 +144,8 @@ def setup_of(options: ExperimentOptions) -> Setup:
     for model in options.model:
         if not model.is_file():
             raise UsageError(f"--model {model}: there is no such file")
+    from simulator.policies.registry import policy_named
+
     for own in options.policy:
         if ":" not in own:
             raise UsageError(f"--policy {own}: write MODULE:CLASS or FILE.py:CLASS; --scheme names a shipped one")
