@@ -6,6 +6,7 @@ import gc
 import ipaddress
 import logging
 import os
+import re
 import signal
 import socket
 import sys
@@ -199,7 +200,9 @@ def _application(settings: Settings, url: str, loaded: Callable[[str], None]) ->
     from service.storage.locks import StoreUnusable
     from service.storage.store import Store
 
-    settings = settings.model_copy(update={"advertise_url": settings.advertise_url or _reachable(url)})
+    # As other machines know an edge that listens on every interface.
+    reachable = re.sub(r"//(0\.0\.0\.0|\[::\])", f"//{socket.gethostname()}", url)
+    settings = settings.model_copy(update={"advertise_url": settings.advertise_url or reachable})
     try:
         store = None if settings.store == "none" else Store(settings.store)
         app = create_app(settings, store)
@@ -221,11 +224,6 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
-
-
-def _reachable(url: str) -> str:
-    """The edge's address as other machines know it, if it listens on every interface."""
-    return url.replace("//0.0.0.0", f"//{socket.gethostname()}").replace("//[::]", f"//{socket.gethostname()}")
 
 
 def _say(text: str, level: int = logging.INFO) -> None:

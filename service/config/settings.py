@@ -45,10 +45,6 @@ def prompt_tokens(row_format: PromptFormat, rows: int, experiences: int, feature
     return _STATIC_TOKENS + row * (rows + experiences)
 
 
-def _default_cache() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aicvds"
-
-
 def _default_store() -> str:
     home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
     return str(home / "aicvds" / "missions.db")
@@ -193,7 +189,9 @@ class Settings(BaseSettings):
     # name is refused; PUT /missions/{id} makes the others.
     create_on_decide: Literal["on", "off"] = "off"
     # Folder of the model file and the token vocabulary.
-    cache_dir: Path = Field(default_factory=_default_cache)
+    cache_dir: Path = Field(
+        default_factory=lambda: Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aicvds"
+    )
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     # `text` for people, `json` (one object a line) for machines.
     log_format: Literal["text", "json"] = "text"

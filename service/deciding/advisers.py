@@ -81,11 +81,6 @@ def _by_value(state: AttendedState) -> Preference:
     return LearnedValues(state.best_by_value(), values)
 
 
-def _by_look_ahead(state: AttendedState) -> Preference:
-    """The LLM-free policy's action."""
-    return OneAction(look_ahead(state.state, state.reach, state.reserved, state.guidance))
-
-
 def look_ahead(state: State, reach: Reach, reserved: Collection[int], guidance: StepGuidance | None = None) -> Action:
     """One step of look-ahead over every velocity and every sensor heard, free and with a battery.
 
@@ -115,5 +110,5 @@ def look_ahead(state: State, reach: Reach, reserved: Collection[int], guidance: 
 ADVISERS: dict[str, Callable[[AttendedState], Preference | None]] = {
     PLANNER: _by_plan,
     "value": _by_value,
-    "policy": _by_look_ahead,
+    "policy": lambda state: OneAction(look_ahead(state.state, state.reach, state.reserved, state.guidance)),
 }

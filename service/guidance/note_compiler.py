@@ -221,6 +221,8 @@ async def compile_note(note: PhrasedNote, scenario: Scenario, llm: ServerPool) -
     """
     started = time.monotonic()
     try:
+        if note.is_foreign and not note.is_read:
+            raise BadOrders("notes are read in English only")
         if note.is_read:
             reading = NoteReading(NO_GUIDANCE)
         elif llm.reads_letters:

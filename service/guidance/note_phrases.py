@@ -34,7 +34,20 @@ def _pattern(phrase: str) -> re.Pattern[str]:
 _PARTS: dict[str, str] = {**_TABLE["parts"], "words": "|".join([*CARDINALS[::-1], *ORDINALS])}
 _ROWS = {kind: [(row, [_pattern(p) for p in row["phrases"]]) for row in _TABLE[kind]] for kind in ("withdraw", "order")}
 _ENDS = {kind: [_pattern(phrase) for phrase in phrases] for kind, phrases in _TABLE["ends"].items()}
-_KINDS = ("conditional", "limited", "once", "times", "added", "lifts", "whole", "place", "apart")
+_KINDS = (
+    "conditional",
+    "limited",
+    "once",
+    "times",
+    "added",
+    "lifts",
+    "whole",
+    "place",
+    "apart",
+    "permits",
+    "spared",
+    "unable",
+)
 _PHRASES = {kind: [_pattern(phrase) for phrase in _TABLE[kind]["phrases"]] for kind in _KINDS}
 _Matches = Iterator[re.Match[str]]
 
@@ -45,6 +58,7 @@ class PhrasedNote:
     Attributes:
         rest: the note in lower case, with spaces in place of these phrases.
         withdrawn: patterns of the names of orders in force that end.
+        is_foreign: whether it has words of another language than English.
 
     Args:
         in_force: the names of the orders in force.
@@ -53,8 +67,9 @@ class PhrasedNote:
     def __init__(self, note: str, scenario: Scenario, in_force: Collection[str]) -> None:
         self._note = note
         self.rest = self._lowered = note.lower()
-        self._scenario = scenario
+        self._scenario, self._in_force = scenario, in_force
         self.withdrawn: list[str] = []
+        self.is_foreign = len(re.findall(_TABLE["foreign"]["words"], self._lowered)) > 1
         self._doubts: list[str] = []
         self._once: dict[str, float] = {}
         self._ends: list[tuple[re.Match[str], str, End | None]] = []
@@ -105,7 +120,7 @@ class PhrasedNote:
             raise BadOrders(f"“{next(iter(refused.values()))}” may end an order or mean a part of the fleet")
         ends = {name: end for name, end in read.ends.items() if name in values}
         ends |= {name: End(visited=int(name[6:])) for name in self._once}
-        doubts = self._doubts + [f"In no order: “{words}”." for words in dict.fromkeys(refused.values())]
+        doubts = self._doubts + [f"In no order: “{words}”." for words in dict.fromkeys(refused.values()) if words]
         for match, kind, end in self._ends:
             names = [n for n in values if n not in self._once and self._in_sentence(n, values[n], match.start())]
             for name in names if end is not None or kind == "visited" else ():
@@ -120,13 +135,21 @@ class PhrasedNote:
     def _refused(self, values: Mapping[str, float]) -> dict[str, str]:
         """The LLM's orders that its words may end or permit, or that no word gives to every sensor, with the words."""
         refused = {}
-        clauses = [" ".join(clause[0].split()) for clause in _CLAUSE.finditer(self.rest)]
+        text = re.sub(r"(?<=\d)(?:,| and|, and) (?=\d)", " ", self.rest)
+        clauses = [" ".join(clause[0].split()) for clause in _CLAUSE.finditer(text)]
         for name, value in values.items():
-            kind = name.partition(":")[0]
+            kind, _, sensor = name.partition(":")
             near = [c for c in clauses if _uses(name, value, numbers_of(c))]
             near = near or [c for c in clauses if re.search(_TABLE["asks"][kind], c)]
-            if (value or kind != "weight") and near and all(_has("lifts", clause) for clause in near):
-                refused[name] = near[0]
+            ignored = kind == "weight" and not value
+            against = _TABLE["against"]["ignore" if ignored else kind]
+            both = f"visit:{sensor}" in values and values.get(f"weight:{sensor}") == 0
+            if both or (kind == "avoid" and not near) or (near and all(any(_has(k, c) for k in against) for c in near)):
+                refused[name] = next(iter(near), " ".join(self.rest.split()))
+            elif ignored and f"visit:{sensor}" in self._in_force and near and all(_has("lifts", c) for c in near):
+                # "No need to visit it" ends the visits, and says nothing of what the sensor loses.
+                refused[name] = ""
+                self.withdrawn.append(f"visit:{sensor}")
         visits = [name for name in values if name.startswith("visit:")]
         whole = any(_has("whole", clause) and not _has("place", clause) for clause in clauses)
         if not whole and len(visits) == self._scenario.sensors > len(numbers_of(self.rest)):
@@ -208,7 +231,9 @@ class PhrasedNote:
             asked = [kind for kind, words in _TABLE["asks"].items() if re.search(words, clause[0])]
             lost = numbers and not all(number.value in used for number in numbers)
             part = asked or _has("whole", clause[0]) or any(number.unit in _VELOCITIES for number in numbers)
-            ignored = not numbers and any(not any(name.startswith(kind) for name in values) for kind in asked)
+            ignored = "none" in asked or (
+                not numbers and any(not any(name.startswith(kind) for name in values) for kind in asked)
+            )
             if lost or ignored or (part and _has("place", clause[0])):
                 yield " ".join(re.sub(r"^\W*(?:and|but|then)\b", "", clause[0]).split())
 

@@ -137,6 +137,8 @@ class OperatorGuidance:
         for name, end in guidance.ends.items():
             if end.step is not None and end.step <= step > 0:
                 raise Impossible(f"ends.{name}.step", f"the mission is at step {step} already")
+            if end.time is not None and end.time <= datetime.now(UTC):
+                raise Impossible(f"ends.{name}.time", "this time has passed")
         kept = NO_GUIDANCE if replaces else self.confirmed.without(self._matching(withdrawn))
         # An order for some steps is counted from here on.
         ends = {n: e if e.steps is None else End(step=step + e.steps) for n, e in guidance.ends.items()}
@@ -219,6 +221,9 @@ class OperatorGuidance:
         """What code doubts of the orders that are in force after a confirmation."""
         if self.status == "proposed" and self._withdrawn and not self._matching(self._withdrawn):
             yield "The orders that the note withdraws are not in force."
+        for name, order in self.confirmed.each_in_words().items():
+            if name in after.ends and after.values[name] != self.confirmed.values[name]:
+                yield f"“{order}” ends too, and does not come back."
         periods = {f"visit:{wish.sensor_id}": wish.visit_every for wish in after.sensors if wish.visit_every}
         needed = sum(1 / every for name, every in periods.items() if not once(name, every, after.ends.get(name)))
         if needed > (uavs := self._scenario.uavs):

@@ -136,7 +136,8 @@ class ServerPool:
         ready = [server for server in self._each if server.status.llm == "ready" and server.max_uavs_per_call >= uavs]
         if len(ready) > 1:
             # A stable sort: where every server is full, the order is as without a limit.
-            ready = sorted(self._ordered(mission_id, ready), key=self._reluctance)
+            ready = sorted(self._ordered(mission_id, ready), key=lambda each: self._calls[each] >= self._slots)
+            ready.sort(key=lambda each: each.paused or each.usability.degraded is not None)
         waiting = deque(ready or self._each[:1])
         if self._hedge_s is not None and len(waiting) == 1:
             # A hedge to the same address: there may be several machines behind it.
@@ -170,9 +171,6 @@ class ServerPool:
                 task.cancel(EARLIER_CALL_ANSWERED if task in later else None)
             await asyncio.gather(*running, return_exceptions=True)
         raise failure or NoDecision("llm_unavailable", "there is no server")
-
-    def _reluctance(self, server: LlmServer) -> tuple[bool, bool]:
-        return server.paused or server.usability.degraded is not None, self._calls[server] >= self._slots
 
     def _ordered(self, mission_id: str, servers: list[LlmServer]) -> list[LlmServer]:
         """Servers in a mission's order: the one of the settings, or by rendezvous hashing."""

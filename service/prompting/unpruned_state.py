@@ -54,17 +54,14 @@ class UnprunedState:
         needs_beacon, place_values = _columns(names)
         unknown = needs_beacon[:, None] & ~self.state.heard
         kinds, counts = np.unique(place_values @ np.where(unknown, 2, numbers < 0), return_counts=True)
-        total = int(_digit_tokens(np.abs(numbers))[~unknown].sum())
+        # The tokenizer makes one token of every three digits.
+        tokens = 1 + np.floor(np.log10(np.maximum(np.abs(numbers), 1))).astype(np.int64) // 3
+        total = int(tokens[~unknown].sum())
         total += count(self.head) if self.head else 0
         for kind, often in zip(kinds.tolist(), counts.tolist(), strict=True):
             text, known = _example_row(self.write, names, kind)
             total += often * (count(text) - known)
         return total
-
-
-def _digit_tokens(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The tokens of whole numbers from 0 on: the tokenizer makes one of every three digits."""
-    return 1 + np.floor(np.log10(np.maximum(numbers, 1))).astype(np.int64) // 3
 
 
 @lru_cache(maxsize=16)

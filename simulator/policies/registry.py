@@ -7,16 +7,7 @@ from typing import Protocol, runtime_checkable
 from shared.kit.own_code import imported
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
-from simulator.policies.hand_written import (
-    EarliestOverflowFirst,
-    LongestQueue,
-    MaximumGain,
-    NearestNeighbour,
-    QueueAndChannel,
-    RandomChoice,
-    RoundRobin,
-    WeightedQueueChannel,
-)
+from simulator.policies import hand_written
 from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.world.observation import Observation
 
@@ -49,16 +40,16 @@ class LearningPolicy(Protocol):
 
 
 _POLICIES: dict[str, Callable[[], Policy]] = {
-    "random": RandomChoice,
-    "round_robin": RoundRobin,
-    "eof": EarliestOverflowFirst,
-    "wqcs": WeightedQueueChannel,
-    "eof_coordinated": partial(EarliestOverflowFirst, coordinated=True),
-    "wqcs_coordinated": partial(WeightedQueueChannel, coordinated=True),
-    "longest_queue": LongestQueue,
-    "queue_and_channel": QueueAndChannel,
-    "max_gain": MaximumGain,
-    "nearest": NearestNeighbour,
+    "random": hand_written.RandomChoice,
+    "round_robin": hand_written.RoundRobin,
+    "eof": hand_written.EarliestOverflowFirst,
+    "wqcs": hand_written.WeightedQueueChannel,
+    "eof_coordinated": partial(hand_written.EarliestOverflowFirst, coordinated=True),
+    "wqcs_coordinated": partial(hand_written.WeightedQueueChannel, coordinated=True),
+    "longest_queue": hand_written.LongestQueue,
+    "queue_and_channel": hand_written.QueueAndChannel,
+    "max_gain": hand_written.MaximumGain,
+    "nearest": hand_written.NearestNeighbour,
     "mpc": RecedingHorizonPolicy,
 }
 POLICY_NAMES: tuple[str, ...] = tuple(_POLICIES)

@@ -13,7 +13,7 @@ from tests.integration.service.api.test_routes import fields
 from tests.integration.service.guidance.test_ended_orders import AT, say
 from tests.integration.service.guidance.test_operator_guidance import Edge, Report
 from tests.support.processes import serving_edge
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, until
 
 VISIT, SLOW = "Visit sensor 4 at least once in every 3 steps", "Never fly faster than 8 m/s"
 LEAK = {"sensors": [{"sensor_id": 4, "visit_every": 3}]}
@@ -137,7 +137,11 @@ def test_an_order_ends_at_its_time(edge: Edge, report: Report) -> None:
     say(client, guidance=ended(time=(now + timedelta(hours=1)).isoformat()))
     client.post("/decide", json=report())
     assert SLOW in client.get(AT).json()["obeyed_in_words"]
-    say(client, guidance=ended(time=(now - timedelta(seconds=1)).isoformat()))
+    past = client.post(AT, json={"guidance": ended(time=now.isoformat())})
+    assert (past.status_code, fields(past)) == (422, ["guidance.ends.max_velocity.time"])
+    over = datetime.now(UTC) + timedelta(seconds=1)
+    say(client, guidance=ended(time=over.isoformat()))
+    until(lambda: datetime.now(UTC) > over)
     client.post("/decide", json=report(step=1))
     assert client.get(AT).json()["obeyed_in_words"] == f"{VISIT}."
 

@@ -109,10 +109,13 @@ def test_what_is_not_understood_says_so_and_changes_nothing(client: httpx.Client
         "The 3 m/s minimum is off, hover if you like.",
         "Sensor 4 is fixed, no longer every 3 steps.",
         "Ease off on sensor 4, every 3 steps was too much.",
+        "Never mind the speed cap, go as fast as you like.",
+        "Do not cancel the visits to sensor 4.",
+        "Bitte Sensor 4 nicht mehr alle drei Schritte anfliegen.",
     ],
 )
 def test_no_note_begins_the_opposite_of_what_it_says(client: httpx.Client, note: str) -> None:
     told = read(client, note, LEAK_AND_LIMIT)
     assert told["begins"] == [], told
-    # It ends the order, or is refused, or says that nothing new would begin.
-    assert told["status"] == "failed" or told["ends"] or any("In force already" in doubt for doubt in told["doubts"])
+    # It ends the order, is refused, or has a doubt.
+    assert told["status"] == "failed" or told["ends"] or told["doubts"]

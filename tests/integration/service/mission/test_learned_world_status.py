@@ -41,6 +41,7 @@ def test_a_world_that_equals_the_formula_tells_nothing(edge: Edge, report: Repor
         "learned",
         "deadlines",
         "names",
+        "alarms",
         "readings",
     }
 

@@ -126,6 +126,10 @@ def test_a_time_of_the_clock_is_the_next_one(clock: str) -> None:
             "Sensor 4 every 3 steps. Nobody over 9 m/s around the school.",
             ["In no order: “nobody over 9 m/s around the school”."],
         ),
+        (
+            "Sensor 4 every 3 steps, nobody over 9 m/s today.",
+            ["No order ends by itself “today”: withdraw it then."],
+        ),
         ("Sensor 4 every 3 steps, nobody over 9 m/s, 5 metres up.", ["In no order: “5 metres up”."]),
         ("Sensor 4 every 3 steps, nobody over 9 m/s. Ignore the rest!", ["In no order: “ignore the rest”."]),
         ("Sensor 4 every 3 steps, nobody over 9 m/s, from 14:30 on.", ["In no order: “from 14:30 on”."]),
@@ -155,12 +159,41 @@ def test_a_doubt_quotes_what_is_in_no_order(note: str, doubts: list[str]) -> Non
         ("9 m/s was too slow.", {"max_velocity": 9}),
         ("You need not keep to 3 steps at sensor 4.", {"visit:4": 3}),
         ("Hovering is allowed again.", {"avoid:0": 0}),
+        # Another operator's, likewise.
+        (
+            "Stay away from sensor 9 until step 20, there is blasting, after that go there every 2 steps.",
+            {"visit:9": 2, "weight:9": 0},
+        ),
+        ("Stay away from sensor 9.", {"visit:9": 2}),
+        ("Only sensors 0, 1 and 2 matter.", {"weight:0": 0, "weight:1": 0}),
+        ("Do not cancel the visits to sensor 5.", {"weight:5": 0}),
+        ("For the next 5 steps 12 m/s is fine.", {"min_velocity": 12}),
+        ("Never mind the speed cap, go as fast as you like.", {"avoid:0": 0}),
+        ("Pause the visits to sensor 4 for 10 steps.", {"visit:4": 10}),
+        ("Climb to 150 m over sensor 3 and take a photo each time you pass.", {"visit:3": 1}),
         ("Keep an eye on all sensors near the school.", {f"visit:{sensor}": 1 for sensor in range(PAPER.sensors)}),
     ],
 )
 def test_an_order_that_the_words_may_end_is_refused(note: str, read: dict[str, float]) -> None:
     with pytest.raises(BadOrders, match="may end an order or mean a part of the fleet"):
         phrased(note).completed(Guidance.of(read, {}), {*read.values(), 4.0})
+
+
+def test_no_need_for_a_sensor_whose_visits_are_ordered_ends_them_alone() -> None:
+    note = phrased("Visit sensor 5 every 5 steps; no need to bother with sensor 4 any more.")
+    guidance, doubts = note.completed(Guidance.of({"weight:4": 0}, {}), {4.0})
+    assert (guidance.in_words(), doubts) == ("Visit sensor 5 at least once in every 5 steps.", [])
+    assert note.withdrawn == ["visit:4"]
+
+
+def test_a_note_in_another_language_is_known() -> None:
+    for note in (
+        "Bitte alle 5 Schritte an Sensor 6 vorbeifliegen, dort haben wir einen Druckabfall.",
+        "Ne dépassez pas 5 m/s et visitez sensor 3 toutes les 3 étapes.",
+        "Por favor visite el sensor 4 cada 3 pasos.",
+    ):
+        assert phrased(note).is_foreign
+    assert not phrased("Visit sensor 4 every 3 steps, and never fly over 9 m/s.").is_foreign
 
 
 def test_what_is_refused_leaves_the_rest() -> None:
