@@ -6,6 +6,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 import schemathesis
 from hypothesis import HealthCheck, given, settings
@@ -15,6 +16,7 @@ from schemathesis.core.result import Ok
 
 from tests.faults.table import Tables
 from tests.support.processes import run, serving_edge
+from tests.support.waiting import PATIENCE_S
 
 pytestmark = [pytest.mark.fuzz, pytest.mark.timeout(1800)]
 
@@ -30,6 +32,8 @@ def operations_of(schema: schemathesis.BaseSchema) -> list[Any]:
 
 def fuzz(url: str, headers: dict[str, str], cases: int) -> Counter[tuple[str, int]]:
     """Statuses by path of so many cases, of all operations alike."""
+    # An edge that loads answers later than schemathesis waits.
+    httpx.get(f"{url}/openapi.json", headers=headers, timeout=PATIENCE_S).raise_for_status()
     schema = schemathesis.openapi.from_url(f"{url}/openapi.json", headers=headers)
     operations = operations_of(schema)
     statuses: Counter[tuple[str, int]] = Counter()
