@@ -40,7 +40,7 @@ def client() -> Iterator[httpx.Client]:
 
 def read(client: httpx.Client, note: str, before: dict[str, Any] | None) -> dict[str, Any]:
     """The guidance of a mission with these orders in force, once the note was read."""
-    mission = f"/missions/{re.sub('[^a-z0-9]', '-', note.lower())}"
+    mission = f"/missions/{re.sub('[^a-z0-9]', '-', note.lower())[:60]}"
     assert client.put(mission, json={"mode": "value"}).status_code == 200
     if before is not None:
         assert client.post(f"{mission}/guidance", json={"guidance": before}).status_code == 200
