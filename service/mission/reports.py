@@ -106,8 +106,7 @@ class Reports:
             positions = positions.copy()
             positions[changed.id] = np.stack((changed.x, changed.y), axis=1)
         x, y = _positions_of(ids, positions, at)
-        known = ([None if value != value else value for value in column.tolist()] for column in columns[1:])
-        queue, battery, gain, seen = known
+        queue, battery, gain, seen = ([None if v != v else v for v in column.tolist()] for column in columns[1:])
         # Validation is skipped: each number passed it when its report arrived.
         whole = SensorColumns.model_construct(
             id=ids.tolist(),

@@ -123,8 +123,7 @@ def row_digits(state: State, reach: Reach, outlook: Outlook, scenario: Scenario)
 def in_words(text: str, shown: Collection[int], scenario: Scenario) -> list[str]:
     """What a prompt's digits say: a sentence on the UAV, then on each row of these sensors, in the prompt's order."""
     capacity, ids = scenario.queue_capacity, {sign(sensor): sensor for sensor in shown}
-    most = {_NINE: "9 or more"}
-    steps, fill = int(text[0]), int(text[1]) / _NINE
+    most, steps, fill = {_NINE: "9 or more"}, int(text[0]), int(text[1]) / _NINE
     words = [f"{most.get(steps, steps)} steps are left. The mean queue is {fill:.0%} full."]
     for queue, own, numbers, letter in _ROW.findall(text[7:]):
         left, packets, hold, reach, others, slow, fast = map(int, numbers)

@@ -56,8 +56,7 @@ class UnprunedState:
         kinds, counts = np.unique(place_values @ np.where(unknown, 2, numbers < 0), return_counts=True)
         # The tokenizer makes one token of every three digits.
         tokens = 1 + np.floor(np.log10(np.maximum(np.abs(numbers), 1))).astype(np.int64) // 3
-        total = int(tokens[~unknown].sum())
-        total += count(self.head) if self.head else 0
+        total = int(tokens[~unknown].sum()) + (count(self.head) if self.head else 0)
         for kind, often in zip(kinds.tolist(), counts.tolist(), strict=True):
             text, known = _example_row(self.write, names, kind)
             total += often * (count(text) - known)

@@ -266,15 +266,18 @@ class Server(uvicorn.Server):
         """Accept the clients that have connected, and wait for their requests: uvicorn would drop them."""
         state = {"server_state": self.server_state, "app_state": self.lifespan.state}
         protocol = partial(BoundedHttpProtocol, config=self.config, **state)
-        # Nothing runs between the last client and the close, or the system would reset those that come meanwhile.
         own = [listening.fileno() for server in self.servers for listening in server.sockets]
+        loop = asyncio.get_running_loop()
+        for listening in own:
+            loop.remove_reader(listening)
+        # asyncio drops a client that it has accepted and not connected yet when its server closes.
+        await asyncio.sleep(0.01)
+        # Nothing runs between the last client and the close, or the system would reset those that come meanwhile.
         clients = [client for listening in own for client in waiting_clients(listening)]
-        for server in self.servers:
-            server.close()
-        for listening in sockets:
-            listening.close()
+        for close in [*(server.close for server in self.servers), *(listening.close for listening in sockets)]:
+            close()
         for client in clients:
-            await asyncio.get_running_loop().connect_accepted_socket(protocol, client)
+            await loop.connect_accepted_socket(protocol, client)
         await asyncio.sleep(_ARRIVING_S)
 
 
