@@ -29,7 +29,7 @@ export function showFleet(mission) {
 
 /** The time of day, and the mission's. */
 export function showClock(mission) {
-  const day = new Date().toLocaleTimeString("en-GB", { timeZoneName: "short" });
+  const day = clock(new Date(), { timeZoneName: "short" });
   say(at("clock"), mission ? `${day} · mission ${missionTime(mission, mission.now.step)}` : day);
 }
 
@@ -76,7 +76,9 @@ function show(id, mission, cells) {
   });
 }
 
-const clock = (date) => date.toLocaleTimeString("en-GB");
+// Without "2-digit", a browser that adds the time zone writes 0:04:47 for 00:04:47.
+const DIGITS = { hour: "2-digit", minute: "2-digit", second: "2-digit" };
+export const clock = (date, more) => date.toLocaleTimeString("en-GB", { ...DIGITS, ...more });
 const seconds = (s) => (s < 120 ? `${shown(s, 0)} s` : `${shown(s / 60, 0)} min`);
 
 function missionTime(mission, step) {

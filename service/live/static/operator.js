@@ -3,6 +3,7 @@
 
 import { at, make, say } from "./dom.js";
 import { post, Refused } from "./edge.js";
+import { clock } from "./fleet.js";
 import { GUIDANCE } from "./words.js";
 
 const EXAMPLE = '{"sensors": [{"sensor_id": 4, "visit_every": 3}], "max_velocity": 10}';
@@ -81,7 +82,7 @@ export class Operator {
     at("orders-words").hidden = orders.length > 0;
     const rows = orders.map((order) => {
       const source = order.note === null ? "" : `, from the note “${order.note}”`;
-      const since = `since step ${order.since_step}, ${new Date(order.since).toLocaleTimeString()}${source}`;
+      const since = `since step ${order.since_step}, ${clock(new Date(order.since))}${source}`;
       const row = make("li", {}, make("span", { class: "words" }, order.in_words), " ", make("span", { class: "hint" }, since), " ");
       if (mayCommand) {
         const end = make("button", { type: "button", "aria-label": `Withdraw: ${order.in_words}` }, "Withdraw");
