@@ -173,6 +173,7 @@ class NoteCompiler:
         """Compile this note; the result is dropped if the mission has another note by then."""
         text, unclear = await asyncio.to_thread(mission.in_ids, note)
         phrased = PhrasedNote(text, mission.scenario, mission.guidance.confirmed.values)
+        unclear += phrased.unsaid
         try:
             async with asyncio.timeout(_TIMEOUT_S), self._lock:
                 if not phrased.is_read:

@@ -43,6 +43,7 @@ _NUMBER = re.compile(
     r"|(?P<digits>\d+(?:\.\d+)?)(?P<suffix>(?:st|nd|rd|th)\b)?"
     r"|(?<!per )(?<!\ba )(?P<second>\bsecond\b)"
     r"|(?<=every )(?P<alternate>other|alternate)\b"
+    r"|\b(?P<couple>(?:a )?couple(?: of)?)\b"
     rf"|\b(?P<tens>{_any(_TENS)})[- ](?P<ones>{_any(CARDINALS[1:10])})\b"
     rf"|\b(?P<word>{_any({*CARDINALS, *ORDINALS, *_TENS, *_FACTORS} - {'second'})})\b"
     r"|(?P<one>(?<!s )(?<!m )(?<!half )\ban?(?= (?:minute|hour)\b)|(?:(?<=every )|(?<=each ))(?=(?:minute|hour)\b))"
@@ -126,7 +127,7 @@ def _value(match: re.Match[str]) -> float | None:
         return float(match["digits"][:9])
     if match["tens"]:
         return 10.0 * (_TENS.index(match["tens"]) + 2) + CARDINALS.index(match["ones"])
-    word = match["word"] or match["second"] or match["alternate"] or "one"
+    word = match["word"] or match["second"] or match["alternate"] or ("two" if match["couple"] else "one")
     if word in _TELLING:
         return _TELLING[word]
     for words in (CARDINALS, ORDINALS):

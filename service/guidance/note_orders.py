@@ -48,7 +48,7 @@ _PATTERNS = {
 
 _NUMBER_WORDS = {word: value for words in (CARDINALS[:15], ORDINALS[:13]) for value, word in enumerate(words)}
 # "Every other step" is every second step. An ignored sensor, or one that is left out, counts 0 times.
-_NUMBER_WORDS |= {"twice": 2, "double": 2, "other": 2, "triple": 3, "ignore": 0, "ignored": 0, "leave": 0}
+_NUMBER_WORDS |= {"twice": 2, "couple": 2, "double": 2, "other": 2, "triple": 3, "ignore": 0, "ignored": 0, "leave": 0}
 _TOKEN = re.compile(r"[0-9]+|[a-z]+|m/s|:")
 
 

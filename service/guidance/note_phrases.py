@@ -34,21 +34,9 @@ def _pattern(phrase: str) -> re.Pattern[str]:
 _PARTS: dict[str, str] = {**_TABLE["parts"], "words": "|".join([*CARDINALS[::-1], *ORDINALS])}
 _ROWS = {kind: [(row, [_pattern(p) for p in row["phrases"]]) for row in _TABLE[kind]] for kind in ("withdraw", "order")}
 _ENDS = {kind: [_pattern(phrase) for phrase in phrases] for kind, phrases in _TABLE["ends"].items()}
-_KINDS = (
-    "conditional",
-    "limited",
-    "once",
-    "times",
-    "added",
-    "lifts",
-    "whole",
-    "place",
-    "apart",
-    "permits",
-    "spared",
-    "unable",
-)
-_PHRASES = {kind: [_pattern(phrase) for phrase in _TABLE[kind]["phrases"]] for kind in _KINDS}
+_PHRASES = {
+    kind: [_pattern(phrase) for phrase in table["phrases"]] for kind, table in _TABLE.items() if "phrases" in table
+}
 _Matches = Iterator[re.Match[str]]
 
 
@@ -93,6 +81,12 @@ class PhrasedNote:
     def orders(self) -> bool:
         """Whether code has read an order or a withdrawal."""
         return bool(self.withdrawn or self._once or self._orders)
+
+    @property
+    def unsaid(self) -> list[str]:
+        """What no order can say, with the reason."""
+        found = [(why, re.search(phrase, self._lowered)) for why, phrase in _TABLE["unsaid"].items()]
+        return [why.format(match[0].strip()) for why, match in found if match]
 
     @property
     def text(self) -> str:

@@ -99,9 +99,8 @@ class OperatorGuidance:
         elif answer.answer == "withdraw" or (answer.answer == "reject" and self.orders and self.status in _ANSWERED):
             self._withdraw(answer.orders, step)
         elif self._proposed is None:
-            raise Conflict(
-                "answer", f"guidance is {self.status}: there is nothing to {answer.answer}; give `guidance` of your own"
-            )
+            todo = "wait until the note is read" if self.status == "compiling" else "give `guidance` of your own"
+            raise Conflict("answer", f"guidance is {self.status}: there is nothing to {answer.answer}; {todo}")
         elif answer.answer == "confirm":
             note = self.note if self._origin != "operator" else None
             try:
@@ -162,10 +161,14 @@ class OperatorGuidance:
             self._begun, self._ended = begun, ended
         now = datetime.now(UTC).replace(microsecond=0)
         words = guidance.each_in_words()
-        for name, record in list(self._in_force.items()):
-            if words.get(name) != record.in_words:
-                over = {"until_step": max(step, record.since_step), "until": now, "why": why}
-                self._over.append(self._in_force.pop(name).model_copy(update=over))
+        over = [name for name, record in self._in_force.items() if words.get(name) != record.in_words]
+        for name in over:
+            record = self._in_force.pop(name)
+            until = {"until_step": max(step, record.since_step), "until": now, "why": why}
+            self._over.append(record.model_copy(update=until))
+        if why != "replaced" and self._proposed is not None and self.status in _ANSWERED:
+            # A repeated confirmation does not bring them back.
+            self._proposed = self._proposed.without(over) or None
         for name, order in words.items():
             if name not in self._in_force:
                 self._in_force[name] = OrderRecord(name=name, in_words=order, note=note, since_step=step, since=now)

@@ -74,6 +74,36 @@ def test_orders_in_force_can_be_withdrawn_whatever_the_note(
         assert say(client, answer="withdraw") == told
 
 
+@pytest.mark.parametrize("ends", [{}, {"max_velocity": {"steps": 1}}])
+def test_a_repeated_confirmation_brings_no_order_back(edge: Edge, report: Report, ends: dict[str, Any]) -> None:
+    client = edge()
+    client.put("/missions/test", json={"mode": "value"})
+    said = say(client, guidance={"max_velocity": 3, "min_velocity": 1, "ends": ends})
+    if ends:
+        for step in range(3):
+            assert client.post("/decide", json=report(step=step)).status_code == 200
+    else:
+        say(client, answer="withdraw", orders=["max_velocity"])
+    left = say(client, answer="confirm")
+    assert left["obeyed_in_words"] == "Never fly slower than 1 m/s." != said["obeyed_in_words"]
+    say(client, answer="withdraw")
+    refused = client.post(AT, json={"answer": "confirm"})
+    assert refused.status_code == 409 and "there is nothing to confirm" in refused.text
+    assert guidance(client, "rejected")["obeyed_in_words"] is None
+
+
+def test_a_note_that_is_being_read_asks_for_patience(edge: Edge) -> None:
+    scribe = Scribe(ORDERS)
+    with serving(scribe.app) as url, scribe.gate:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        client.put("/missions/test", json={"mode": "value"})
+        scribe.gate.shut()
+        say(client, note=NOTE)
+        refused = client.post(AT, json={"answer": "confirm"})
+        assert refused.status_code == 409 and "wait until the note is read" in refused.text
+
+
 def test_a_note_that_failed_cannot_be_rejected_and_ends_no_order(edge: Edge) -> None:
     client = edge()
     client.put("/missions/test", json={"mode": "value"})

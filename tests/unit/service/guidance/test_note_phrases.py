@@ -219,6 +219,31 @@ def test_an_end_is_that_of_its_own_words(note: str, words: str) -> None:
     assert (guidance.in_words(), doubts) == (words, [])
 
 
+@pytest.mark.parametrize(
+    ("note", "reasons"),
+    [
+        ("UAV 2 should fly at most 8 m/s", ["An order is for every UAV, and none for “uav 2” alone."]),
+        ("Drone #1: visit sensor 4 every 3 steps", ["An order is for every UAV, and none for “drone #1” alone."]),
+        ("Stay above 50 m near sensor 3", ["No order is about heights: “above 50 m”."]),
+        ("altitude at least 40 metres", ["No order is about heights: “altitude”."]),
+        ("From step 20 on, ignore 3", ["An order begins with its confirmation, and not “from step 20 on”."]),
+        ("Slow down to 5 m/s tomorrow", ["An order begins with its confirmation, and not “tomorrow”."]),
+        ("If it rains, slow down to 5 m/s", ["No order has a condition: “if it rains”."]),
+        ("fly at 12 m/s, at least 5 m/s, above 9 mph until step 20", []),
+        ("visit sensor 4 for the next 5 steps as often as you can if you like", []),
+    ],
+)
+def test_what_no_order_can_say_has_its_reason(note: str, reasons: list[str]) -> None:
+    assert phrased(note).unsaid == reasons
+
+
+@pytest.mark.parametrize("words", ["every couple of steps", "once every couple of steps", "every 2 steps"])
+def test_a_couple_is_two(words: str) -> None:
+    note = phrased(f"Visit sensor 4 {words}.")
+    assert note.is_read
+    assert note.completed(NO_GUIDANCE, ()) == (Guidance.of({"visit:4": 2}, {}), [])
+
+
 @given(
     st.text(max_size=280)
     | st.lists(
