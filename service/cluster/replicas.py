@@ -109,8 +109,7 @@ class ServeOwners:
 
     async def ask_all(self, request: Exchanged, within_s: float) -> dict[str, Answer]:
         async def found() -> dict[str, Answer]:
-            asked = self._handle.broadcast("named_answer", request)
-            answers = await asked.results_async(return_exceptions=True)
+            answers = await self._handle.broadcast("named_answer", request).results_async(return_exceptions=True)
             return dict(sorted(answer for answer in answers if not isinstance(answer, BaseException)))
 
         answers = await _in_time(found, within_s)

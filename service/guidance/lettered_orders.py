@@ -19,7 +19,7 @@ SEPARATOR = "; "
 NOTHING, UNCLEAR, MOVE, ALL, OTHERS = "nothing", "unclear", "move", "all", "others"
 PARTLY = "A part of the note is unclear, and is in no order"
 _MOST_ORDERS = 8
-_METRES_A_SECOND = {None: 1.0, "m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "kn": 0.514444}
+METRES_A_SECOND = {None: 1.0, "m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "kn": 0.514444}
 _SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 # A converted velocity this near to a whole number is that number.
 _ROUNDING = 0.05
@@ -200,9 +200,9 @@ class _Orders:
 
     def _velocity(self, words: list[str], rounded: Callable[[float], int]) -> int:
         number = self._number(words[0]) if len(words) == 1 else None
-        if number is None or number.unit not in _METRES_A_SECOND:
+        if number is None or number.unit not in METRES_A_SECOND:
             raise BadOrders("a velocity has no number in m/s, km/h, mph or knots")
-        value = number.value * _METRES_A_SECOND[number.unit]
+        value = number.value * METRES_A_SECOND[number.unit]
         return round(value) if abs(value - round(value)) <= _ROUNDING else rounded(value)
 
 

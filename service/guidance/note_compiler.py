@@ -75,8 +75,7 @@ async def read_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReadi
 
 def _request(note: LetteredNote) -> Rewriting:
     def constrain(_: Constraint) -> dict[str, object]:
-        likeliest = {"logprobs": True, "top_logprobs": _LIKELIEST}
-        return {"grammar": grammar(note), "max_tokens": _MOST_TOKENS, **likeliest}
+        return {"grammar": grammar(note), "max_tokens": _MOST_TOKENS, "logprobs": True, "top_logprobs": _LIKELIEST}
 
     return Rewriting(STATIC, [], note.text, constrain)
 
@@ -183,8 +182,7 @@ class NoteCompiler:
                 compiled = await compile_note(phrased, mission.scenario, self._llm)
             if _waits_for(mission, note):
                 model = None if phrased.is_read else self._llm.notes_model
-                doubts = (*unclear, *compiled.doubts)
-                mission.propose_guidance(compiled.guidance, model, doubts, phrased.withdrawn)
+                mission.propose_guidance(compiled.guidance, model, (*unclear, *compiled.doubts), phrased.withdrawn)
                 self._on_change(mission.mission_id)
             return
         except (BadOrders, Impossible, NoDecision) as error:

@@ -25,9 +25,7 @@ ORDINALS = [
     "eleventh", "twelfth", "thirteenth", "fourteenth", "fifteenth", "sixteenth", "seventeenth", "eighteenth",
     "nineteenth", "twentieth",
 ]
-_TENS = [
-    "twenty", "thirty", "forty", "fifty", "sixty", "seventy", "eighty", "ninety",
-]
+_TENS = ["twenty", "thirty", "forty", "fifty", "sixty", "seventy", "eighty", "ninety"]
 # fmt: on
 # These words stay next to their letter: they carry more meaning than a number.
 _FACTORS = {"twice": 2.0, "double": 2.0, "doubly": 2.0, "triple": 3.0, "thrice": 3.0, "half": 0.5}
@@ -42,10 +40,10 @@ _NUMBER = re.compile(
     r"(?P<clock>\d{1,2}:\d{2}(?::\d{2})?)"
     r"|(?P<digits>\d+(?:\.\d+)?)(?P<suffix>(?:st|nd|rd|th)\b)?"
     r"|(?<!per )(?<!\ba )(?P<second>\bsecond\b)"
-    r"|(?<=every )(?P<alternate>other|alternate)\b"
-    r"|\b(?P<couple>(?:a )?couple(?: of)?)\b"
+    r"|(?<=every )(?P<alternate>other|alternate)\b|(?<!quick )(?<!last )(?<!another )(?<!other )(?<!new )\bone\b"
+    r"|\b(?P<some>(?:a )?(?:couple(?: of)?|dozen))\b"
     rf"|\b(?P<tens>{_any(_TENS)})[- ](?P<ones>{_any(CARDINALS[1:10])})\b"
-    rf"|\b(?P<word>{_any({*CARDINALS, *ORDINALS, *_TENS, *_FACTORS} - {'second'})})\b"
+    rf"|\b(?P<word>{_any({*CARDINALS, *ORDINALS, *_TENS, *_FACTORS} - {'second', 'one'})})\b"
     r"|(?P<one>(?<!s )(?<!m )(?<!half )\ban?(?= (?:minute|hour)\b)|(?:(?<=every )|(?<=each ))(?=(?:minute|hour)\b))"
 )
 _UNITS = {
@@ -127,7 +125,8 @@ def _value(match: re.Match[str]) -> float | None:
         return float(match["digits"][:9])
     if match["tens"]:
         return 10.0 * (_TENS.index(match["tens"]) + 2) + CARDINALS.index(match["ones"])
-    word = match["word"] or match["second"] or match["alternate"] or ("two" if match["couple"] else "one")
+    some = "one" if match["some"] is None else "twelve" if "dozen" in match["some"] else "two"
+    word = match["word"] or match["second"] or match["alternate"] or some
     if word in _TELLING:
         return _TELLING[word]
     for words in (CARDINALS, ORDINALS):

@@ -48,7 +48,8 @@ _PATTERNS = {
 
 _NUMBER_WORDS = {word: value for words in (CARDINALS[:15], ORDINALS[:13]) for value, word in enumerate(words)}
 # "Every other step" is every second step. An ignored sensor, or one that is left out, counts 0 times.
-_NUMBER_WORDS |= {"twice": 2, "couple": 2, "double": 2, "other": 2, "triple": 3, "ignore": 0, "ignored": 0, "leave": 0}
+_NUMBER_WORDS |= {"twice": 2, "double": 2, "other": 2, "triple": 3, "ignore": 0, "ignored": 0, "leave": 0}
+_NUMBER_WORDS |= {"couple": 2, "dozen": 12}
 _TOKEN = re.compile(r"[0-9]+|[a-z]+|m/s|:")
 
 
@@ -138,8 +139,7 @@ def similar_examples(note: str, count: int = _EXAMPLES_SHOWN) -> list[tuple[str,
     Similarity is the cosine of the tf-idf weights of words and pairs of words.
     """
     similarity = [_similarity(_features(note), _features(example)) for example, _ in EXAMPLES]
-    order = sorted(range(len(EXAMPLES)), key=lambda i: similarity[i])
-    return [EXAMPLES[i] for i in order[-count:]]
+    return [EXAMPLES[i] for i in sorted(range(len(EXAMPLES)), key=lambda i: similarity[i])[-count:]]
 
 
 def number_of(token: str) -> int | None:

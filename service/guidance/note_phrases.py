@@ -12,7 +12,7 @@ from functools import partial
 from importlib.resources import files
 from typing import Any
 
-from service.guidance.lettered_orders import SEPARATOR, meaning
+from service.guidance.lettered_orders import METRES_A_SECOND, SEPARATOR, meaning
 from service.guidance.note_numbers import CARDINALS, ORDINALS, LetteredNote, Number, numbers_of
 from service.guidance.note_orders import BadOrders
 from shared.planning.orders import NO_GUIDANCE, End, Guidance
@@ -93,7 +93,8 @@ class PhrasedNote:
         """The rest as the LLM reads it; the note as it is written if code has read nothing."""
         if self.rest == self._lowered:
             return self._note
-        return re.sub(r"\s+(?=[.,;:!?]|$)|^(?:\W|and |then )+", "", " ".join(self.rest.split()))
+        rest = re.sub(r"[\s,;:]*\s(?=[.,;:!?]|$)|^(?:\W|and |then )+", "", " ".join(self.rest.split()))
+        return re.sub(r"(?<=[.!?])[,;:.]+", "", rest)
 
     @property
     def is_read(self) -> bool:
@@ -108,7 +109,7 @@ class PhrasedNote:
             numbers: the numbers of the rest that its orders use.
         """
         own = self._read_orders()
-        refused = self._refused(read.values)
+        refused = self._refused({name: value for name, value in read.values.items() if name not in own.values})
         values = {**{n: v for n, v in read.values.items() if n not in refused}, **own.values, **self._once}
         if refused and not values and not self.withdrawn:
             raise BadOrders(f"“{next(iter(refused.values()))}” may end an order or mean a part of the fleet")
@@ -123,7 +124,8 @@ class PhrasedNote:
                     ends[name] = its
             if kind != "open" and not any(name in ends for name in names):
                 doubts.append(f"No order ends by itself “{match[0].strip()}”: withdraw it then.")
-        doubts += [f"In no order: “{clause}”." for clause in self._unread(values, numbers)]
+        sensors = (float(name[6:]) for name in own.values if name.startswith("visit:"))
+        doubts += [f"In no order: “{clause}”." for clause in self._unread(values, {*numbers, *sensors})]
         return Guidance.of(values, ends), doubts
 
     def _refused(self, values: Mapping[str, float]) -> dict[str, str]:
@@ -131,6 +133,9 @@ class PhrasedNote:
         refused = {}
         text = re.sub(r"(?<=\d)(?:,| and|, and) (?=\d)", " ", self.rest)
         clauses = [" ".join(clause[0].split()) for clause in _CLAUSE.finditer(text)]
+        measures = [n for n in numbers_of(text) if n.unit or not re.search(_TABLE["whose"]["words"], text[: n.begin])]
+        step_s = self._scenario.step_s
+        periods = {1, *(int(n.value * _SECONDS.get(n.unit or "", step_s) / step_s) for n in measures)}
         for name, value in values.items():
             kind, _, sensor = name.partition(":")
             near = [c for c in clauses if _uses(name, value, numbers_of(c))]
@@ -138,12 +143,17 @@ class PhrasedNote:
             ignored = kind == "weight" and not value
             against = _TABLE["against"]["ignore" if ignored else kind]
             both = f"visit:{sensor}" in values and values.get(f"weight:{sensor}") == 0
-            if both or (kind == "avoid" and not near) or (near and all(any(_has(k, c) for k in against) for c in near)):
+            measured = value in periods if kind == "visit" else "_" not in kind or _uses(name, value, measures)
+            denied = near and all(any(_has(k, c) for k in against) for c in near)
+            if both or denied or not measured or (kind == "avoid" and not near):
                 refused[name] = next(iter(near), " ".join(self.rest.split()))
-            elif ignored and f"visit:{sensor}" in self._in_force and near and all(_has("lifts", c) for c in near):
+            elif ignored and near and all(_has("lifts", c) for c in near):
                 # "No need to visit it" ends the visits, and says nothing of what the sensor loses.
-                refused[name] = ""
-                self.withdrawn.append(f"visit:{sensor}")
+                if f"visit:{sensor}" in self._in_force:
+                    refused[name] = ""
+                    self.withdrawn.append(f"visit:{sensor}")
+                elif any(_has("ended", c) for c in near):
+                    refused[name] = near[0]
         visits = [name for name in values if name.startswith("visit:")]
         whole = any(_has("whole", clause) and not _has("place", clause) for clause in clauses)
         if not whole and len(visits) == self._scenario.sensors > len(numbers_of(self.rest)):
@@ -216,8 +226,7 @@ class PhrasedNote:
         ends = [match.span() for match, _, _ in self._ends]
         numbers = [n for n in numbers_of(self._lowered) if not any(begin <= n.begin < end for begin, end in ends)]
         before, around = ([n for n in numbers if b <= n.begin < e] for b, e in ((begin, at), sentence))
-        here = before or around
-        return _uses(name, value, here) or not _uses(name, value, numbers)
+        return _uses(name, value, before or around) or not _uses(name, value, numbers)
 
     def _unread(self, values: Mapping[str, float], used: Collection[float]) -> Iterator[str]:
         for clause in _CLAUSE.finditer(self.rest):
@@ -240,7 +249,8 @@ def _uses(name: str, value: float, numbers: list[Number]) -> bool:
     kind, _, number = name.partition(":")
     if kind in ("visit", "weight"):
         return any(one.unit is None and one.value == int(number) for one in numbers)
-    return any(one.unit in _VELOCITIES or (one.unit is None and one.value == value) for one in numbers)
+    speeds = [one.value * METRES_A_SECOND[one.unit] for one in numbers if one.unit in METRES_A_SECOND]
+    return any(abs(speed - value) < 1 for speed in speeds)
 
 
 def _names(row: Mapping[str, Any], match: re.Match[str]) -> list[str]:

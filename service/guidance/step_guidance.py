@@ -37,8 +37,7 @@ class StepGuidance:
             visits: the step of each sensor's last visit, by sensor ID; -1 for never.
         """
         allowed = guidance.allowed(scenario.max_velocity + 1)
-        overdue = guidance.overdue(step, visits)[state.ids] > 0
-        due = overdue & state.able & reach.likely & allowed[:, None]
+        due = (guidance.overdue(step, visits)[state.ids] > 0) & state.able & reach.likely & allowed[:, None]
         weights = guidance.weights(scenario.sensors)[state.ids]
         worth = (weights - 1.0) * state.urgency * reach.packets + scenario.queue_capacity * due
         return cls(allowed, due, np.where(allowed[:, None], worth, -np.inf))

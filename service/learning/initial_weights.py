@@ -26,8 +26,7 @@ def initial_parameters(init: Init, preset: Features, levels: int, seed: int) -> 
     """
     if init == "random":
         return _random(preset, levels, seed)
-    weights = _packaged(preset)
-    return {k: v[:levels] if preset == "paper" and k in _LEVEL_TENSORS else v for k, v in weights.items()}
+    return {k: v[:levels] if preset == "paper" and k in _LEVEL_TENSORS else v for k, v in _packaged(preset).items()}
 
 
 @cache

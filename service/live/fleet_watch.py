@@ -127,5 +127,4 @@ def _overflowed(belief: FleetBelief, step: int, scenario: Scenario) -> FloatArra
     arrived = belief.arrivals.rate * np.maximum(step - belief.since, 0) / scenario.overflow_horizon_steps
     # One more packet turns "more than full" into "at least full".
     reached = overflow_probability(belief.base + 1, arrived, scenario)
-    full = np.where(belief.base >= scenario.queue_capacity, 1.0, reached)
-    return np.where(belief.base_variance > 0, 0.0, full)
+    return np.where(belief.base_variance > 0, 0.0, np.where(belief.base >= scenario.queue_capacity, 1.0, reached))

@@ -61,8 +61,7 @@ class ServerPool:
 
     def serving(self, mission_id: str) -> LlmServer:
         """The first server of a mission that is ready, or its first of all."""
-        each = self._each if len(self._each) == 1 else self._ordered(mission_id, self._each)
-        return _first_usable(each)
+        return _first_usable(self._each if len(self._each) == 1 else self._ordered(mission_id, self._each))
 
     @property
     def status(self) -> Literal["loading", "ready", "unavailable", "off"]:

@@ -61,8 +61,7 @@ class Outlook:
     def of(cls, view: Viewpoint, scenario: Scenario) -> Self:
         """From the fleet's belief."""
         metres = _PACE * scenario.max_velocity * scenario.step_s * np.arange(1.0, _STEPS + 1.0)
-        fleet = {view.uav_id, *view.belief.present(view.step)}
-        reached = {uav: _reached(view, uav, metres, scenario) for uav in fleet}
+        reached = {uav: _reached(view, uav, metres, scenario) for uav in {view.uav_id, *view.belief.present(view.step)}}
         own = reached.pop(view.uav_id)
         others = np.sum([steps.sum(axis=0) for steps in reached.values()], axis=0, dtype=np.int64)
         return cls(own.sum(axis=0), np.broadcast_to(others, own.shape[1:]), own)

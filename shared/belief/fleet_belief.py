@@ -301,8 +301,7 @@ class FleetBelief:
 
     def copy(self) -> Self:
         """A copy for another thread, which later changes of this belief do not affect."""
-        constant = (self._scenario, self._paths)
-        return deepcopy(self, {id(one): one for one in constant})
+        return deepcopy(self, {id(one): one for one in (self._scenario, self._paths)})
 
     def state_dict(self) -> dict[str, Any]:
         """The whole belief, as copies."""

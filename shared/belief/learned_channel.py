@@ -86,8 +86,7 @@ class RadioFailures:
         if self.none and not failed:
             return
         self.none = False
-        odds = float(self._odds[sensor]) + (_FAILED if failed else _SENT)
-        self._odds[sensor] = min(max(odds, _PRIOR), _MOST)
+        self._odds[sensor] = min(max(float(self._odds[sensor]) + (_FAILED if failed else _SENT), _PRIOR), _MOST)
 
     def advance(self, step: int) -> None:
         """Go to a later step: earlier evidence counts less."""

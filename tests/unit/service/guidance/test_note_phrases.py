@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.guidance.note_numbers import numbers_of
 from service.guidance.note_orders import BadOrders
 from service.guidance.note_phrases import PhrasedNote
 from shared.planning.orders import NO_GUIDANCE, Guidance, Impossible, SensorWish
@@ -38,7 +39,11 @@ def phrased(note: str) -> PhrasedNote:
         ("Stop visiting sensor 4 now.", ["visit:4"]),
         ("Sensor 4 needs no visits any more.", ["visit:4"]),
         ("Remove the orders for sensor 4", ["visit:4", "weight:4"]),
+        ("There's no need to keep popping over to sensor 4 anymore.", ["visit:4"]),
         ("Stop ignoring sensor 7.", ["weight:7"]),
+        ("Treat sensor 7 like any other sensor.", ["weight:7"]),
+        ("Drop everything we had before.", ["*"]),
+        ("Forget all the orders I gave you earlier", ["*"]),
         ("Lift the speed limit.", ["*_velocity", "avoid:*"]),
     ],
 )
@@ -172,11 +177,42 @@ def test_a_doubt_quotes_what_is_in_no_order(note: str, doubts: list[str]) -> Non
         ("Pause the visits to sensor 4 for 10 steps.", {"visit:4": 10}),
         ("Climb to 150 m over sensor 3 and take a photo each time you pass.", {"visit:3": 1}),
         ("Keep an eye on all sensors near the school.", {f"visit:{sensor}": 1 for sensor in range(PAPER.sensors)}),
+        # Of two more.
+        ("It's sensor 6 that wants a visit, not sensor 9.", {"weight:9": 0}),
+        ("Only sensor 4 is left, you can drop the visits to 6 and 8.", {"weight:6": 0, "weight:8": 0}),
+        ("There's a school by sensor 3, so give the yard a wide berth.", {"max_velocity": 3}),
+        ("Every sensor looked in on, except 9.", {"visit:4": 9}),
+        ("If the queue at sensor 0 ever gets past forty packets, head over there.", {"visit:0": 40}),
+        ("Keep everybody to 36 km/h tops.", {"min_velocity": 10}),
+        ("Leave 6, 7 and 8 on the schedule they have.", {"avoid:6": 6, "avoid:7": 7, "avoid:8": 8}),
     ],
 )
 def test_an_order_that_the_words_may_end_is_refused(note: str, read: dict[str, float]) -> None:
     with pytest.raises(BadOrders, match="may end an order or mean a part of the fleet"):
         phrased(note).completed(Guidance.of(read, {}), {*read.values(), 4.0})
+
+
+def test_an_end_does_not_reach_a_limit_in_another_unit() -> None:
+    note = phrased("Fly at least 10 knots. Max 12 m/s for the next 20 steps.")
+    guidance, doubts = note.completed(NO_GUIDANCE, ())
+    assert (guidance.in_words(), doubts) == (
+        "Never fly slower than 6 m/s. Never fly faster than 12 m/s, for 20 steps.",
+        [],
+    )
+
+
+def test_a_quick_one_is_no_sensor() -> None:
+    assert [number.value for number in numbers_of("quick one: one visit of sensor one, the other one too")] == [1, 1]
+
+
+def test_a_list_of_visits_with_one_verb_is_for_the_llm() -> None:
+    assert not phrased("Visit 1 every 5 steps, 8 every 4 and 9 at least once in ten steps.").orders
+
+
+def test_one_visit_in_the_midst_of_a_sentence_is_read() -> None:
+    note = phrased("They smell gas, so get a drone over to sensor 9 right away, just the once.")
+    guidance, _ = note.completed(NO_GUIDANCE, ())
+    assert guidance.in_words() == "Visit sensor 9 once, as soon as possible."
 
 
 def test_no_need_for_a_sensor_whose_visits_are_ordered_ends_them_alone() -> None:
@@ -228,8 +264,13 @@ def test_an_end_is_that_of_its_own_words(note: str, words: str) -> None:
         ("altitude at least 40 metres", ["No order is about heights: “altitude”."]),
         ("From step 20 on, ignore 3", ["An order begins with its confirmation, and not “from step 20 on”."]),
         ("Slow down to 5 m/s tomorrow", ["An order begins with its confirmation, and not “tomorrow”."]),
+        (
+            "Scrap all except visit 4.",
+            ["No order has an exception: “except visit 4”; where a withdrawal has one, withdraw order by order."],
+        ),
         ("If it rains, slow down to 5 m/s", ["No order has a condition: “if it rains”."]),
         ("fly at 12 m/s, at least 5 m/s, above 9 mph until step 20", []),
+        ("If nobody was at sensor 4 for six steps, go there.", []),
         ("visit sensor 4 for the next 5 steps as often as you can if you like", []),
     ],
 )
