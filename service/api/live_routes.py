@@ -119,8 +119,7 @@ async def list_missions(engine: TheEngine, request: Request) -> MissionList:
     missions = engine.missions
     loaded = {mission.mission_id: mission for mission in missions.loaded}
     lately = [name for name in engine.live.history.missions() if name in loaded]
-    known = dict.fromkeys((*lately, *reversed(loaded), *missions.stored))
-    names = [name for name in known if may_know(request, name)]
+    names = [name for name in dict.fromkeys((*lately, *reversed(loaded), *missions.stored)) if may_know(request, name)]
     lines = []
     for name in names[:_MOST_LISTED]:
         mission = loaded.get(name)

@@ -100,8 +100,7 @@ def _most(found: Sequence[tuple[NoteReading | BadOrders | Impossible, float]], n
     """The most frequent reading, the likelier of equal ones; raises the most frequent error."""
     texts = [str(one) if isinstance(one, Exception) else one.guidance.model_dump_json() for one, _ in found]
     often = Counter(texts)
-    best = max(range(len(found)), key=lambda i: (often[texts[i]], found[i][1]))
-    reading = found[best][0]
+    reading = found[max(range(len(found)), key=lambda i: (often[texts[i]], found[i][1]))][0]
     if isinstance(reading, Exception):
         raise reading
     doubts = list(reading.doubts)

@@ -27,6 +27,8 @@ from shared.wire.schemas import MissionSpec
 _CONNECT_S = 5
 _STATEMENT_MS = 5000
 _IDLE_MS = 1500
+# In the midst of a pipeline a session does not count as idle. Versions before 17 have no limit of a whole transaction.
+_LIMITED = "SELECT set_config(name, '3000', false) FROM pg_settings WHERE name = 'transaction_timeout'"
 # An arbitrary key, which no other program of the same database may use.
 _MIGRATING = 0x41494356
 # Schemas of versions before the first release, whose missions this one cannot read.
@@ -211,7 +213,9 @@ def _engine(url: str) -> sa.Engine:
         "options": f"-c lock_timeout={BUSY_MS} -c statement_timeout={_STATEMENT_MS} "
         f"-c idle_in_transaction_session_timeout={_IDLE_MS}",
     }
-    return sa.create_engine(parsed, pool_pre_ping=True, connect_args={**limits, **parsed.query})
+    engine = sa.create_engine(parsed, pool_pre_ping=True, connect_args={**limits, **parsed.query})
+    sa.event.listen(engine, "connect", lambda db, _: (db.execute(_LIMITED), db.commit()))
+    return engine
 
 
 def _prepare(connection: Any, _: object) -> None:

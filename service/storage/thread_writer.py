@@ -77,7 +77,7 @@ class ThreadWriter:
             loop.call_soon_threadsafe(done, failure)
 
     def _transact(self, missions: set[tuple[str, int]], transaction: Sequence[Statement]) -> None:
-        """Send one transaction in one round trip: the database never waits while rows are locked."""
+        """Send one transaction in one round trip: the database waits for this edge only if it is paused in between."""
         from psycopg.errors import DivisionByZero
 
         # A connection of its own: one from the pool would be tried before each transaction.

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
+import psycopg
 import pytest
 import sqlalchemy as sa
 from alembic import command
@@ -23,6 +24,7 @@ from service.storage.rows import SCHEMA
 from service.storage.store import Store
 from shared.wire.schemas import MissionSpec
 from tests.support.stored_missions import written
+from tests.support.waiting import PATIENCE_S
 
 TERM_S = 3600.0
 
@@ -167,6 +169,32 @@ def test_an_owner_that_stops_in_the_midst_of_a_transaction_does_not_keep_others_
                 assert "lock timeout" in str(error)
         assert answer == 2
         db.exec_driver_sql("SELECT 1")
+
+
+def test_an_owner_that_stops_in_the_midst_of_a_pipeline_does_not_keep_others_out_for_long(
+    store: Store, edges: tuple[Leases, Leases]
+) -> None:
+    one, other = edges
+    acquired(one)
+    expire(store)
+    refused, answer = 0, None
+    connection = store._engine.raw_connection()
+    db: Any = connection.driver_connection
+    db.autocommit = True
+    # As the writer is when it is paused between two messages.
+    with pytest.raises(psycopg.OperationalError, match="closed the connection"), db.pipeline():
+        db.execute("BEGIN")
+        one.fence(db, {("m", 1)})
+        while answer is None:
+            try:
+                answer = acquired(other)
+            except sa.exc.OperationalError as error:
+                assert "lock timeout" in str(error)
+                refused += 1
+                assert refused < PATIENCE_S
+        db.execute("COMMIT")
+    connection.invalidate()
+    assert (answer, refused > 0) == (2, True)
 
 
 async def test_a_transaction_of_a_lost_mission_writes_nothing(store: Store) -> None:
