@@ -113,6 +113,9 @@ def test_an_edge_is_added_under_load_and_ended_without(
                 status = client.get(f"/missions/{name}").json()
                 assert (status["decisions"], status["feedback"]) == (rounds, rounds)
             until(lambda: len(samples(client, "aicvds_leases")) == 1)
+            # A mission that the other edge decided while it ended is taken over with its next request.
+            for name in NAMES:
+                decided(client, report(mission_id=name, step=rounds))
             # The edge counts its leases when it renews them.
             until(lambda: samples(client, "aicvds_leases")[0] >= len(NAMES))
 
