@@ -184,6 +184,7 @@ def test_a_doubt_quotes_what_is_in_no_order(note: str, doubts: list[str]) -> Non
         ("Every sensor looked in on, except 9.", {"visit:4": 9}),
         ("If the queue at sensor 0 ever gets past forty packets, head over there.", {"visit:0": 40}),
         ("Keep everybody to 36 km/h tops.", {"min_velocity": 10}),
+        ("2 got a new battery, so stop ignoring it.", {"weight:2": 0}),
         ("Leave 6, 7 and 8 on the schedule they have.", {"avoid:6": 6, "avoid:7": 7, "avoid:8": 8}),
     ],
 )
