@@ -20,7 +20,7 @@ NOTHING, UNCLEAR, MOVE, ALL, OTHERS = "nothing", "unclear", "move", "all", "othe
 PARTLY = "A part of the note is unclear, and is in no order"
 _MOST_ORDERS = 8
 METRES_A_SECOND = {None: 1.0, "m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "kn": 0.514444}
-_SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
+SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 # A converted velocity this near to a whole number is that number.
 _ROUNDING = 0.05
 
@@ -188,8 +188,8 @@ class _Orders:
     def _period(self, letter: str) -> int:
         """Steps; a time is rounded down to whole steps."""
         number = self._number(letter)
-        if number.unit in _SECONDS:
-            steps = number.value * _SECONDS[number.unit] / self._scenario.step_s
+        if number.unit in SECONDS:
+            steps = number.value * SECONDS[number.unit] / self._scenario.step_s
         elif number.unit in (None, "steps") and number.value.is_integer():
             steps = number.value
         else:

@@ -12,7 +12,7 @@ from functools import partial
 from importlib.resources import files
 from typing import Any
 
-from service.guidance.lettered_orders import METRES_A_SECOND, SEPARATOR, meaning
+from service.guidance.lettered_orders import METRES_A_SECOND, SECONDS, SEPARATOR, meaning
 from service.guidance.note_numbers import CARDINALS, ORDINALS, LetteredNote, Number, numbers_of
 from service.guidance.note_orders import BadOrders
 from shared.planning.orders import NO_GUIDANCE, End, Guidance
@@ -21,8 +21,6 @@ from shared.world.scenario import Scenario
 _TABLE = tomllib.loads(files("service.guidance").joinpath("note_phrases.toml").read_text(encoding="utf-8"))
 _STOP = re.compile(r"[.;!?](?=\s|$)")
 _CLAUSE = re.compile(r"(?:[^.,;:!?]|[.,:](?=\S))+?(?=[.,;:!?](?:\s|$)| and | but | - |\n|$)")
-_VELOCITIES = ("m/s", "km/h", "mph", "kn")
-_SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
 def _pattern(phrase: str) -> re.Pattern[str]:
@@ -85,7 +83,7 @@ class PhrasedNote:
     @property
     def unsaid(self) -> list[str]:
         """What no order can say, with the reason."""
-        found = [(why, re.search(phrase, self._lowered)) for why, phrase in _TABLE["unsaid"].items()]
+        found = [(why, _pattern(phrase).search(self._lowered)) for why, phrase in _TABLE["unsaid"].items()]
         return [why.format(match[0].strip()) for why, match in found if match]
 
     @property
@@ -135,7 +133,7 @@ class PhrasedNote:
         clauses = [" ".join(clause[0].split()) for clause in _CLAUSE.finditer(text)]
         measures = [n for n in numbers_of(text) if n.unit or not re.search(_TABLE["whose"]["words"], text[: n.begin])]
         step_s = self._scenario.step_s
-        periods = {1, *(int(n.value * _SECONDS.get(n.unit or "", step_s) / step_s) for n in measures)}
+        periods = {1, *(int(n.value * SECONDS.get(n.unit or "", step_s) / step_s) for n in measures)}
         for name, value in values.items():
             kind, _, sensor = name.partition(":")
             near = [c for c in clauses if _uses(name, value, numbers_of(c))]
@@ -200,7 +198,7 @@ class PhrasedNote:
             return None
         number = numbers_of(match["N"])[0]
         if kind == "steps":
-            seconds = _SECONDS.get(number.unit or "", self._scenario.step_s) * number.value
+            seconds = SECONDS.get(number.unit or "", self._scenario.step_s) * number.value
             return End(steps=max(1, round(seconds / self._scenario.step_s)))
         return End(step=int(number.value) + (kind == "through"))
 
@@ -233,7 +231,7 @@ class PhrasedNote:
             numbers = [n for n in numbers_of(clause[0]) if clause[0][n.begin : n.end] not in ("one", "first", "second")]
             asked = [kind for kind, words in _TABLE["asks"].items() if re.search(words, clause[0])]
             lost = numbers and not all(number.value in used for number in numbers)
-            part = asked or _has("whole", clause[0]) or any(number.unit in _VELOCITIES for number in numbers)
+            part = asked or _has("whole", clause[0]) or any(n.unit and n.unit in METRES_A_SECOND for n in numbers)
             ignored = "none" in asked or (
                 not numbers and any(not any(name.startswith(kind) for name in values) for kind in asked)
             )

@@ -3,7 +3,8 @@
 A lease has an owner, an epoch and an end. The owner is one run of an edge's process. The epoch grows when another owner
 takes the lease, and never shrinks. Only the database's clock counts. The transaction that writes the journal locks the
 leases of its missions and compares their epochs (:meth:`Leases.fence`): an owner that was paused or disconnected cannot
-write after its successor, whatever its own clock says. No transaction that locks a lease waits for its edge.
+write after its successor, whatever its own clock says. A transaction that locks a lease waits for its edge only where
+that is paused between two messages, and ends then by the store's time limits.
 """
 
 from __future__ import annotations
