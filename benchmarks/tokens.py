@@ -113,7 +113,7 @@ def by_step(flights: Sequence[Sequence[Asked]]) -> dict[str, dict[int, list[floa
     for step in sorted({asked.step for asked in every}):
         prompts = {way: [asked.ways[way].prompt for asked in every if asked.step == step] for way in (LLM, PAPER)}
         counts = {way: [counter.count(prompt.state) for prompt in of_way] for way, of_way in prompts.items()}
-        counts["all"] = [prompt.uncompressed.tokens(counter.count) for prompt in prompts[PAPER]]
+        counts["all"] = [counter.account(prompt).state_uncompressed for prompt in prompts[PAPER]]
         for way, own in counts.items():
             found[way][step] = [statistics.fmean(own), statistics.pstdev(own)]
     return found

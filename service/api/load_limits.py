@@ -100,7 +100,7 @@ class RequestLimits:
 
     async def _body(self, scope: Scope, receive: Receive, send: Send) -> bytes | None:
         """The decoded body, to which the scope's headers are adapted; None if the request is already answered."""
-        headers = {name.lower(): value for name, value in scope["headers"]}
+        headers = dict(scope["headers"])
         encoding = headers.get(b"content-encoding", b"identity").decode("latin-1").strip().lower()
         if encoding not in _DECODERS and encoding not in _PLAIN:
             response = problem_response(415, f"Content-Encoding {encoding[:40]!r}: use gzip, zstd or none")

@@ -141,8 +141,7 @@ class Experiences:
             return []
         features = np.stack([features for _, features in known])
         distance = np.sqrt(((features[:, None] - rows[None]) ** 2).mean(axis=2)).min(axis=1)
-        order = np.argsort(distance, kind="stable")
-        return _distinct(known[i][0] for i in order)[:keep][::-1]
+        return _distinct(known[i][0] for i in np.argsort(distance, kind="stable"))[:keep][::-1]
 
 
 def _distinct(lines: Iterable[str]) -> list[str]:

@@ -115,6 +115,7 @@ class Template:
             experiences="".join(experiences),
             state=last + "".join(map(row, cells(state, kept_rows))),
             uncompressed=UnprunedState(state, row, last),
+            kept=kept_rows,
         )
 
 

@@ -4,6 +4,7 @@ The static block is byte-identical for a mission's life, and the experiences onl
 server with a prefix cache processes only the last block anew. The column names are part of the static block.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from service.prompting.unpruned_state import UnprunedState
@@ -16,12 +17,14 @@ class Prompt:
     Attributes:
         state: the last block. It includes experiences retrieved for this decision only, which are not cached.
         uncompressed: the last block without pruning by attention and without masks, with the same experiences.
+        kept: the sensors' rows of ``state`` if it is ``uncompressed`` but for the other rows; None if it differs.
     """
 
     static: str
     experiences: str
     state: str
     uncompressed: UnprunedState
+    kept: Sequence[int] | None = None
 
     @property
     def user(self) -> str:

@@ -51,9 +51,16 @@ def introduction(features: Features) -> str:
 
 def cells(state: State, rows: Sequence[int] | NDArray[np.int64]) -> list[dict[str, str]]:
     """The texts of these rows, in this order."""
-    columns, which = full_columns(state), np.asarray(rows, dtype=np.int64)
-    texts = [[str(round(number)) for number in column[which].tolist()] for column in columns.values()]
-    return [dict(zip(columns, row, strict=True)) for row in zip(*texts, strict=True)]
+    names, numbers = whole_numbers(state)
+    return [
+        dict(zip(names, map(str, row), strict=True)) for row in numbers.T[np.asarray(rows, dtype=np.int64)].tolist()
+    ]
+
+
+def whole_numbers(state: State) -> tuple[tuple[str, ...], NDArray[np.int64]]:
+    """The columns' names, and their numbers ``(columns, J)`` as they are written."""
+    columns = full_columns(state)
+    return tuple(columns), np.rint([*columns.values()]).astype(np.int64)
 
 
 def full_columns(state: State) -> dict[str, NDArray[Any]]:

@@ -28,8 +28,10 @@ class TokenCounter:
         """The length of each block of a prompt, and the prompt's length without pruning."""
         static = self.count_repeated(prompt.static)
         experiences = sum(self.count_repeated(line) for line in prompt.experiences.splitlines(keepends=True))
-        state = self.count(prompt.state)
-        state_uncompressed = prompt.uncompressed.tokens(self.count_repeated)
+        rows = prompt.uncompressed.tokens_by_row(self.count_repeated)
+        head = self.count(prompt.uncompressed.head)
+        state = self.count(prompt.state) if prompt.kept is None else head + int(rows[[*prompt.kept]].sum())
+        state_uncompressed = head + int(rows.sum())
         return Tokens(
             tokenizer=self.name,
             static=static,

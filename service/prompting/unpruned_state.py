@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from service.prompting.rows import ALWAYS_KNOWN, UNKNOWN, Cells, full_columns
+from service.prompting.rows import ALWAYS_KNOWN, UNKNOWN, Cells, whole_numbers
 from shared.features.augmented_state import State
 
 # The placeholder for a number while the text around it is counted: one token, and not zero, which has no sign.
@@ -36,31 +36,28 @@ class UnprunedState:
     @property
     def text(self) -> str:
         """The block's text."""
-        columns = full_columns(self.state)
-        names = tuple(columns)
-        numbers = np.rint(np.array(list(columns.values())).T).astype(np.int64)
+        names, numbers = whole_numbers(self.state)
         unknown = ~self.state.heard[:, None] & _columns(names)[0]
         lines = [
             self.write({n: UNKNOWN if u else str(v) for n, v, u in zip(names, row, missing, strict=True)})
-            for row, missing in zip(numbers.tolist(), unknown.tolist(), strict=True)
+            for row, missing in zip(numbers.T.tolist(), unknown.tolist(), strict=True)
         ]
         return self.head + "".join(lines)
 
-    def tokens(self, count: Callable[[str], int]) -> int:
-        """``count(text)``, for a tokenizer that splits digits and lines as o200k_base does."""
-        columns = full_columns(self.state)
-        names = tuple(columns)
-        numbers = np.rint(np.array(list(columns.values()))).astype(np.int64)
+    def tokens_by_row(self, count: Callable[[str], int]) -> NDArray[np.int64]:
+        """``count(line)`` of the sensors' lines ``(J,)``; o200k_base splits digits and lines as this does."""
+        names, numbers = whole_numbers(self.state)
         needs_beacon, place_values = _columns(names)
         unknown = needs_beacon[:, None] & ~self.state.heard
-        kinds, counts = np.unique(place_values @ np.where(unknown, 2, numbers < 0), return_counts=True)
+        sizes, longer = np.where(unknown, 0, np.abs(numbers)), 1000
+        kinds = place_values @ np.where(unknown, 2, numbers < 0)
+        tokens = np.zeros_like(kinds)
+        for kind in set(kinds.tolist()):
+            tokens[kinds == kind] = count(_example_row(self.write, names, kind))
         # The tokenizer makes one token of every three digits.
-        tokens = 1 + np.floor(np.log10(np.maximum(np.abs(numbers), 1))).astype(np.int64) // 3
-        total = int(tokens[~unknown].sum()) + (count(self.head) if self.head else 0)
-        for kind, often in zip(kinds.tolist(), counts.tolist(), strict=True):
-            text, known = _example_row(self.write, names, kind)
-            total += often * (count(text) - known)
-        return total
+        while (above := sizes >= longer).any():
+            tokens, longer = tokens + above.sum(axis=0), longer * 1000
+        return tokens
 
 
 @lru_cache(maxsize=16)
@@ -70,16 +67,15 @@ def _columns(names: tuple[str, ...]) -> tuple[NDArray[np.bool_], NDArray[np.int6
 
 
 @lru_cache(maxsize=256)
-def _example_row(write: Callable[[Cells], str], names: tuple[str, ...], kind: int) -> tuple[str, int]:
-    """A row, and how many of its numbers are known.
+def _example_row(write: Callable[[Cells], str], names: tuple[str, ...], kind: int) -> str:
+    """A row whose known numbers have one digit.
 
     Args:
         kind: a number to the base 3 with one digit for each column, the first column's last: 1 for a negative number, 2
             for an unknown one, 0 for any other.
     """
-    cells, known = {}, 0
+    cells = {}
     for name in names:
         kind, sign = divmod(kind, 3)
         cells[name] = (_PLACEHOLDER, f"-{_PLACEHOLDER}", UNKNOWN)[sign]
-        known += sign < 2
-    return write(cells), known
+    return write(cells)

@@ -65,10 +65,10 @@ def overflow_probability(queue: ArrayLike, rate: ArrayLike, scenario: Scenario) 
     room = np.floor(capacity - np.minimum(np.maximum(np.asarray(queue, dtype=np.float64), 0), capacity))
     mean = np.asarray(rate, dtype=np.float64) * scenario.overflow_horizon_steps
     # Copies, because numba would compile the function again for arrays that are read-only.
-    rooms, means = np.array(np.broadcast_arrays(room, mean))
-    above = np.empty(rooms.shape)
-    above_poisson(rooms.ravel(), means.ravel(), above.ravel())
-    return above
+    both = np.empty((3, *np.broadcast(room, mean).shape))
+    both[0], both[1] = room, mean
+    above_poisson(both[0].ravel(), both[1].ravel(), both[2].ravel())
+    return np.asarray(both[2])
 
 
 def urgency(queue: ArrayLike, rate: ArrayLike, scenario: Scenario) -> FloatArray:
