@@ -192,8 +192,7 @@ class NoteCompiler:
             log.exception("mission %s: the note was not compiled", mission.mission_id)
             reason = f"{type(error).__name__}: see the log"
         if _waits_for(mission, note):
-            reason = " ".join((*unclear, f"{reason}; give `guidance` of your own"))
-            mission.fail_guidance(reason, self._llm.notes_model)
+            mission.fail_guidance(" ".join((*unclear, f"{reason}; give `guidance` of your own")), self._llm.notes_model)
             self._on_change(mission.mission_id)
 
     async def _wait_for_llm(self) -> None:

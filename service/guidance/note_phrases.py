@@ -124,16 +124,18 @@ class PhrasedNote:
                 doubts.append(f"No order ends by itself “{match[0].strip()}”: withdraw it then.")
         sensors = (float(name[6:]) for name in own.values if name.startswith("visit:"))
         doubts += [f"In no order: “{clause}”." for clause in self._unread(values, {*numbers, *sensors})]
-        return Guidance.of(values, ends), doubts
+        return Guidance.of(values, ends), list(dict.fromkeys(doubts))
 
     def _refused(self, values: Mapping[str, float]) -> dict[str, str]:
         """The LLM's orders that its words may end or permit, or that no word gives to every sensor, with the words."""
         refused = {}
         text = re.sub(r"(?<=\d)(?:,| and|, and) (?=\d)", " ", self.rest)
         clauses = [" ".join(clause[0].split()) for clause in _CLAUSE.finditer(text)]
-        measures = [n for n in numbers_of(text) if n.unit or not re.search(_TABLE["whose"]["words"], text[: n.begin])]
+        numbers = numbers_of(text)
+        measures = [n for n in numbers if n.unit or not re.search(_TABLE["whose"]["words"], text[: n.begin])]
         step_s = self._scenario.step_s
         periods = {1, *(int(n.value * SECONDS.get(n.unit or "", step_s) / step_s) for n in measures)}
+        whole = any(_has("whole", clause) and not _has("place", clause) for clause in clauses)
         for name, value in values.items():
             kind, _, sensor = name.partition(":")
             near = [c for c in clauses if _uses(name, value, numbers_of(c))]
@@ -142,6 +144,8 @@ class PhrasedNote:
             against = _TABLE["against"]["ignore" if ignored else kind]
             both = f"visit:{sensor}" in values and values.get(f"weight:{sensor}") == 0
             measured = value in periods if kind == "visit" else "_" not in kind or _uses(name, value, measures)
+            if kind == "weight" and value and not whole and not re.search("doubl|twice|tripl", text):
+                measured = [n.value for n in numbers].count(value) > (f"visit:{value:g}" in values)
             denied = near and all(any(_has(k, c) for k in against) for c in near)
             if both or denied or not measured or (kind == "avoid" and not near):
                 refused[name] = next(iter(near), " ".join(self.rest.split()))
@@ -152,10 +156,11 @@ class PhrasedNote:
                     self.withdrawn.append(f"visit:{sensor}")
                 elif any(_has("ended", c) for c in near):
                     refused[name] = near[0]
-        visits = [name for name in values if name.startswith("visit:")]
-        whole = any(_has("whole", clause) and not _has("place", clause) for clause in clauses)
-        if not whole and len(visits) == self._scenario.sensors > len(numbers_of(self.rest)):
-            refused |= dict.fromkeys(visits, " ".join(self.rest.split()))
+        for kind in () if whole else ("visit", "weight"):
+            named = [name for name in values if name.startswith(kind)]
+            rest = kind == "weight" and re.search(r"\b(?:rest|others?|elsewhere)\b", text)
+            if not rest and len(named) == self._scenario.sensors > len(numbers):
+                refused |= dict.fromkeys(named, " ".join(self.rest.split()))
         return refused
 
     def _taken(self, patterns: list[re.Pattern[str]], wanted: Callable[[re.Match[str]], bool] = bool) -> _Matches:

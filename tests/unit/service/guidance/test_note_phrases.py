@@ -45,6 +45,12 @@ def phrased(note: str) -> PhrasedNote:
         ("Drop everything we had before.", ["*"]),
         ("Forget all the orders I gave you earlier", ["*"]),
         ("Lift the speed limit.", ["*_velocity", "avoid:*"]),
+        ("Speed cap is off again.", ["*_velocity", "avoid:*"]),
+        ("speed limit dropped", ["*_velocity", "avoid:*"]),
+        ("crew fixed 4, no need to go there anymore. Leave the rest as it is", ["visit:4"]),
+        ("All good at sensor 4, nobody needs to go there. Everything else stays as it is.", ["visit:4"]),
+        ("4 is fine again, we don't need to check on it", ["visit:4"]),
+        ("scrap what I said about 4, rest stays the same", ["visit:4", "weight:4"]),
     ],
 )
 def test_what_a_note_withdraws_is_read_whole(note: str, withdrawn: list[str]) -> None:
@@ -237,6 +243,37 @@ def test_what_is_refused_leaves_the_rest() -> None:
     note = phrased("The 9 m/s cap is off, but sensor 4 every 3 steps.")
     kept = Guidance(sensors=READ.sensors)
     assert note.completed(READ, {3.0, 4.0, 9.0}) == (kept, ["In no order: “the 9 m/s cap is off”."])
+
+
+@pytest.mark.parametrize(
+    ("note", "read", "in_no_order"),
+    [
+        # Nobody asks that every sensor is ignored, or weighs one by another's number.
+        ("the crew was at 3", {f"weight:{j}": 0 for j in range(10)}, "the crew was at 3"),
+        (
+            "5 and 8 need a visit at least every 6 steps",
+            {"visit:5": 6, "visit:8": 6, "weight:5": 8},
+            "5 8 need a visit",
+        ),
+        ("5 is repaired, we don't need to check it", {"weight:5": 0}, "5 is repaired"),
+        ("the cap is gone, and keep moving", {"avoid:0": 0}, "the cap is gone"),
+    ],
+)
+def test_what_no_word_asks_for_is_in_no_order(note: str, read: dict[str, float], in_no_order: str) -> None:
+    found = phrased(note)
+    try:
+        guidance, doubts = found.completed(Guidance.of(read, {}), {3.0, 5.0, 6.0, 8.0})
+    except BadOrders as refused:
+        assert f"“{in_no_order}" in str(refused)
+    else:
+        assert guidance.values == {name: value for name, value in read.items() if not name.startswith("weight")}
+        assert any(doubt.startswith(f"In no order: “{in_no_order}") for doubt in doubts)
+
+
+def test_all_sensors_but_some_may_be_ignored() -> None:
+    read = Guidance.of({"weight:0": 2, **{f"weight:{j}": 0 for j in range(1, 10)}}, {})
+    for note in ("sensor 0 counts twice, ignore the rest", "sensor 0 counts twice, forget all others"):
+        assert phrased(note).completed(read, {0.0})[0] == read
 
 
 @pytest.mark.parametrize(
