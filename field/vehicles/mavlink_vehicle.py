@@ -255,8 +255,7 @@ class MavlinkVehicle:
     async def mission(self) -> list[MissionItem]:
         """The mission on board, without ArduPilot's home."""
         items = await self._command("give its mission", self._mission.download_mission())
-        flown = items[1:] if self._ardupilot else items
-        return [_item(item) for item in flown]
+        return [_item(item) for item in items[1 if self._ardupilot else 0 :]]
 
     async def set_speed(self, speed_m_s: float) -> None:
         """``MAV_CMD_DO_CHANGE_SPEED``, ground speed."""

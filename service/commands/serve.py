@@ -62,8 +62,7 @@ class ServeOptions:
 
     def settings(self) -> dict[str, Any]:
         """The settings that were given as options; the environment has the others."""
-        names = ("host", "port", "mode", "llm_url", "llm_model", "store")
-        given = {name: getattr(self, name) for name in names}
+        given = {name: getattr(self, name) for name in ("host", "port", "mode", "llm_url", "llm_model", "store")}
         return {name: value for name, value in given.items() if value is not None}
 
 

@@ -166,8 +166,7 @@ class LeasedOwnership:
         renewed = self._leases.renew(self._term_s)
         for mission_id, lease in leases.items():
             # The next request for the mission of an ended lease takes it again, unless another edge has it by then.
-            valid = renewed.get(mission_id) == lease.epoch
-            lease.until = asked_at + self._term_s if valid else 0.0
+            lease.until = asked_at + self._term_s if renewed.get(mission_id) == lease.epoch else 0.0
         ended = [mission_id for mission_id, lease in leases.items() if not lease.until]
         taken = self._leases.taken(ended) if ended else set[str]()
         unowned = self._leases.unowned()

@@ -73,12 +73,10 @@ def top_k(scores: Array, k: int) -> list[int]:
     """Indices of the k best scores, best first; of all where there are fewer. Of equals, the first."""
     losses = -scores
     if len(scores) <= max(_MANY, k):
-        best: list[int] = losses.argsort(kind="stable")[:k].tolist()
-        return best
+        return list(losses.argsort(kind="stable")[:k].tolist())
     # Of many, only those not behind the k-th are sorted.
     ahead = np.flatnonzero(~(losses > np.partition(losses, k - 1)[k - 1]))
-    best = ahead[losses[ahead].argsort(kind="stable")[:k]].tolist()
-    return best
+    return list(ahead[losses[ahead].argsort(kind="stable")[:k]].tolist())
 
 
 class Weights:

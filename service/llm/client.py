@@ -207,8 +207,7 @@ class LLMClient:
         for read in (json.loads, streamed):
             with suppress(ValueError, RecursionError):
                 return read(content)
-        said = excerpt(content, self._secrets)
-        raise NoDecision("llm_error", f"{self.base_url}: a 200 that is not JSON: {said!r}")
+        raise NoDecision("llm_error", f"{self.base_url}: a 200 that is not JSON: {excerpt(content, self._secrets)!r}")
 
     async def _exchange(
         self, method: str, url: URL, sent: bytes | None, headers: dict[str, str], exchange: _Exchange

@@ -31,8 +31,7 @@ class ResolvedSpec(MissionSpec):
     def of(cls, spec: MissionSpec, settings: Settings) -> Self:
         """The spec, completed by the service's settings and the defaults of its mode."""
         mode = spec.mode or settings.mode
-        adapted = settings.adapted and mode in LLM_MODES
-        row_format = spec.prompt.format or ("compact" if adapted else "csv")
+        row_format = spec.prompt.format or ("compact" if settings.adapted and mode in LLM_MODES else "csv")
         compact = row_format == "compact"
         # Mode `llm` is the paper's method, unless the spec or the adapter differs.
         as_published = mode == "llm" and not compact

@@ -85,8 +85,7 @@ def _redraw(
         odds, behind = current.odds[j, step, LEVELS:], current.behind[j, step]
         idle = dot(odds, behind[LEVELS:], new.terms)
         levels, chance = tables.moved[uav, at, place, j], tables.chance[uav, at, place, j]
-        served = visited(new, odds, behind, idle, levels, chance)
-        saved = float(idle - served)
+        saved = float(idle - visited(new, odds, behind, idle, levels, chance))
         if len(tables.late):
             new.sensor[step, uav] = nowhere
             saved += float(lateness(tables, new.sensor, new.place, j))

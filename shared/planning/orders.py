@@ -136,8 +136,7 @@ class Guidance(Received):
     def _each_sensor_once(self) -> Self:
         ids = [wish.sensor_id for wish in self.sensors]
         if len(set(ids)) < len(ids):
-            twice = next(i for i in ids if ids.count(i) > 1)
-            raise ValueError(f"sensors names sensor {twice} more than once")
+            raise ValueError(f"sensors names sensor {next(i for i in ids if ids.count(i) > 1)} more than once")
         return self
 
     def __bool__(self) -> bool:

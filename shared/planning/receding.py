@@ -162,8 +162,7 @@ class RecedingHorizon:
         """Go to a later step: drop the plans' flown steps. The belief advances separately."""
         if step <= self.step:
             return
-        passed = step - self.step
-        self.plans = {uav: actions[passed:] for uav, actions in self.plans.items()}
+        self.plans = {uav: actions[step - self.step :] for uav, actions in self.plans.items()}
         self.step = step
 
     def copy(self) -> Self:

@@ -113,8 +113,7 @@ class Formulation:
         for step in range(problem.horizon):
             reached = links[step][: (step + 1) * fastest + 1]
             now = model.new_int_var(0, len(reached) - 1, f"c_{uav}_{step}")
-            velocity = now - (row[-1] if row else 0)
-            model.add_linear_constraint(velocity, 0, fastest)
+            model.add_linear_constraint(now - (row[-1] if row else 0), 0, fastest)
             row.append(now)
             self._serve_within(uav, step, now, np.minimum(reached, self._most[step]))
         self.flown.append(row)

@@ -254,6 +254,5 @@ def _write_results(
         command=job.command,
     )
     flown = summarise(facts, flight.decisions, tallies).model_copy(update={"names": job.site.names, **extra})
-    summary = _with_bound(job, flight, flown, console)
-    write_results(job.out, summary, flight, tallies, console)
+    write_results(job.out, _with_bound(job, flight, flown, console), flight, tallies, console)
     return INTERRUPTED if flight.interrupted else 0
