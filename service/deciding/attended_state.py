@@ -184,6 +184,12 @@ class AttendedState:
         """IDs of the sensors that attention keeps, best first."""
         return [candidate.sensor_id for candidate in self.candidates]
 
+    def show_probabilities(self, sensors: Sequence[int], probabilities: NDArray[np.float64]) -> None:
+        """Add to each candidate the LLM's probabilities ``(n,)`` of the n answers that name these sensors."""
+        for at, candidate in enumerate(self.candidates):
+            llm = round(float(probabilities[np.equal(sensors, candidate.sensor_id)].sum()), 4)
+            self.candidates[at] = candidate.model_copy(update={"llm": llm})
+
     def shown(self) -> list[int]:
         """``rows`` in the order of the prompt: as they are, or shuffled by the mission's seed, the step and the UAV."""
         spec = self.mission.spec

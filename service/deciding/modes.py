@@ -158,6 +158,7 @@ class LetterMode(LlmMode):
         probabilities = advice.over(question.candidates.actions)
         if probabilities is None:
             return Fallback(advice.reason or "answer_format", advice.completion, advice.model)
+        state.show_probabilities([action.sensor_id for action in question.candidates.actions], probabilities)
         answer = question.candidates.actions[int(probabilities.argmax())]
         try:
             verify(state, answer)

@@ -45,8 +45,7 @@ class ThreadWriter:
     def write(self, changes: Sequence[Change], done: Done) -> None:
         """As :class:`Writer` says."""
         missions = {(change.mission_id, change.epoch) for change in changes}
-        statements = self._statements.of(changes)
-        self._jobs.put(partial(self._write, missions, statements, done, asyncio.get_running_loop()))
+        self._jobs.put(partial(self._write, missions, self._statements.of(changes), done, asyncio.get_running_loop()))
 
     def close(self) -> None:
         """As :class:`Writer` says."""

@@ -173,6 +173,7 @@ class Candidate(Wire):
 
     sensor_id: SensorId
     score: float
+    llm: float | None = omitted("mode `llm` with the compact prompt: the probability of the letters that name it")
 
 
 class Weighed(Wire):

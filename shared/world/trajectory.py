@@ -88,8 +88,7 @@ class Polyline:
         if not legs.sum() > 0:
             raise ValueError("a trajectory needs at least two different waypoints")
         # A leg of length 0 would be two points at one arc length.
-        keep = np.concatenate(([True], legs > 0))
-        self._points: FloatArray = points[keep]
+        self._points: FloatArray = points[np.concatenate(([True], legs > 0))]
         self._reached: FloatArray = np.concatenate(([0.0], np.cumsum(legs[legs > 0])))
         self.length_m = float(self._reached[-1])
 

@@ -242,8 +242,7 @@ def _search(formulation: Formulation, budget: Budget, strategy: Mapping[str, Any
     # Python handles Ctrl-C, not the solver.
     solver.parameters.catch_sigint_signal = False
     status, stopped = _solved(solver, formulation.model, budget)
-    found = status in (cp_model.OPTIMAL, cp_model.FEASIBLE)
-    actions = formulation.actions(solver.value) if found else None
+    actions = formulation.actions(solver.value) if status in (cp_model.OPTIMAL, cp_model.FEASIBLE) else None
     # Lost packets are whole numbers; any fraction is the solver's rounding.
     bound = max(0, math.ceil(solver.best_objective_bound - 1e-6))
     return _Search(actions, bound, status == cp_model.OPTIMAL, stopped)

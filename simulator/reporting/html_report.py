@@ -84,8 +84,7 @@ def playback(
         "trajectories": [_rounded(path.at(np.linspace(0.0, path.length_m, each))) for path in trajectories(scenario)],
         "frames": [_frame(one, by_step[one.step], scenario.battery_j) for one in instants],
     }
-    script = files("simulator.reporting").joinpath("playback.js").read_text(encoding="utf-8")
-    return Playback(mission, stride, script)
+    return Playback(mission, stride, files("simulator.reporting").joinpath("playback.js").read_text(encoding="utf-8"))
 
 
 def _frame(instant: Instant, decisions: list[list[Any]], battery_j: float) -> dict[str, Any]:
@@ -196,8 +195,7 @@ def write_report(
         OSError: a file cannot be written.
     """
     drawn = drawings(summary, scenario, decisions, tallies, sensor_xy)
-    instants = track.until(summary.steps_flown)
-    played = playback(scenario, sensor_xy, decisions, instants, track.stride)
+    played = playback(scenario, sensor_xy, decisions, track.until(summary.steps_flown), track.stride)
     if played is not None:
         played.mission["names"] = (summary.names or Names()).model_dump()
     path.write_text(render_report(summary, scenario, decisions, drawn, played), encoding="utf-8")

@@ -77,9 +77,8 @@ def centre_of(degrees: ArrayLike) -> tuple[float, float]:
     east, north = np.radians(longitude), np.radians(latitude)
     x, y, z = np.mean((np.cos(north) * np.cos(east), np.cos(north) * np.sin(east), np.sin(north)), axis=1)
     # Rounded, since the last bits of the mean depend on how it is summed.
-    lon_0 = round(float(np.degrees(np.arctan2(y, x))), 6)
-    lat_0 = round(float(np.degrees(np.arctan2(z, np.hypot(x, y)))), 6)
-    return lon_0, lat_0
+    lon_0, lat_0 = np.degrees((np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)))).tolist()
+    return round(lon_0, 6), round(lat_0, 6)
 
 
 def fit_square(points: FloatArray) -> tuple[FloatArray, float]:

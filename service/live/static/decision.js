@@ -31,7 +31,8 @@ function candidates(answer, mission) {
   const columns = guided
     ? [["Sensor", (c) => mission.sensor(c.sensor_id)], ["m/s", (c) => c.velocity], ["LLM", (c) => (c.llm === null ? "silent" : c.llm.toFixed(3))],
        ["Advisers", (c) => c.mixture.toFixed(3)], ["Expected loss", (c) => c.regret.toFixed(2)], ["Score", (c) => c.score.toFixed(2)]]
-    : [["Sensor", (c) => mission.sensor(c.sensor_id)], ["Attention score", (c) => c.score.toFixed(3)]];
+    : [["Sensor", (c) => mission.sensor(c.sensor_id)], ["Attention score", (c) => c.score.toFixed(3)],
+       ...(answer.top_k.some((c) => c.llm !== undefined) ? [["LLM", (c) => (c.llm ?? 0).toFixed(3)]] : [])];
   const rows = (guided ?? answer.top_k).map((row) =>
     make("tr", chosen(row) ? { class: "chosen" } : {}, ...columns.map(([, cell]) => make("td", {}, String(cell(row)))), make("td", {}, chosen(row) ? "flown" : "")));
   const head = make("tr", {}, ...columns.map(([name]) => make("th", { scope: "col" }, name)), make("td", {}));

@@ -155,8 +155,7 @@ def items_of(trajectory: Sequence[Point], altitude_m: float) -> list[MissionItem
         trajectory: longitudes and latitudes, degrees. It is flown there and back, in laps if the last is the first.
         altitude_m: above the take-off place.
     """
-    ring = trajectory[0] == trajectory[-1]
-    flown = trajectory[:-1] if ring else (*trajectory, *trajectory[-2:0:-1])
+    flown = trajectory[:-1] if trajectory[0] == trajectory[-1] else (*trajectory, *trajectory[-2:0:-1])
     items = [MissionItem("take-off", 1, TAKEOFF, trajectory[0], altitude_m)]
     for number, position in enumerate(flown, start=2):
         items.append(MissionItem(f"waypoint {number - 2}", number, WAYPOINT, position, altitude_m))

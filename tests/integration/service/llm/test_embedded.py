@@ -122,6 +122,8 @@ def test_the_adapters_prompt_is_short_and_little_of_it_is_read_anew(report: Repo
             answer = edge.post("/decide", json=body).json()
             assert (answer["source"], answer["reason"]) == ("llm", None)
             assert answer["tokens"]["completion"] == 1
+            # The probabilities of the letters, by sensor.
+            assert sum(kept["llm"] for kept in answer["top_k"]) == pytest.approx(1.0, abs=1e-3)
             read.append((answer["tokens"]["server_prompt"], answer["tokens"]["cached"]))
     assert all(whole <= 130 for whole, _ in read), read
     assert all(whole - cached <= 70 for whole, cached in read[1:]), read
