@@ -8,12 +8,17 @@ from typing import Any
 import httpx
 import pytest
 from playwright.sync_api import Page, expect
+from starlette.responses import Response
 
+from service.api.app import create_app
+from service.config.settings import Settings
 from shared.wire.names import MapShape, Names
 from shared.wire.schemas import MissionSpec
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.world.observation import decide_request
 from tests.e2e.page.conftest import Open, violations
+from tests.support.running import serving
+from tests.support.stub_llm import StubLlm, said, wait_for
 from tests.support.waiting import PATIENCE_S
 from tests.support.world_folders import EXAMPLE
 
@@ -151,3 +156,30 @@ def test_a_real_flights_next_waypoint_has_a_clock_time(visit: Open, edge: str) -
     expect(page.locator("#fleet-rows tr").first).to_contain_text(re.compile(r"north.*1 at \d\d:\d\d:\d\d, "))
     # Without a name of its own.
     expect(page.locator("#fleet-rows tr").nth(1)).to_contain_text("UAV 1")
+
+
+class Letters(StubLlm):
+    """Gives letter A ten times the probability of B."""
+
+    async def respond(self, body: dict[str, Any], probed: bool) -> Response:
+        likeliest = [{"token": "A", "logprob": -0.1}, {"token": "B", "logprob": -2.4}]
+        usage = {"prompt_tokens": 300, "completion_tokens": 1}
+        return said("A", usage, logprobs={"content": [{"token": "A", "logprob": -0.1, "top_logprobs": likeliest}]})
+
+
+def test_a_decision_shows_how_the_letters_probabilities_fell(visit: Open) -> None:
+    with serving(Letters("A").app) as llm:
+        settings = Settings(mode="llm", llm_url=f"{llm}/v1", llm_adapter="served", deadline_ms=60_000)
+        with serving(create_app(settings)) as edge, httpx.Client(base_url=edge) as client:
+            wait_for(client, "ready")
+            make(edge, "letters", names=None)
+            fly(edge, "letters", 1)
+            page = visit(f"{edge}/?mission=letters")
+            page.locator("#feed button").first.click()
+            table = page.locator("#decision table").first
+            expect(table.locator("th")).to_have_text(["Sensor", "Attention score", "LLM"])
+            shares = [float(text) for text in table.locator("td:nth-child(3)").all_inner_texts()]
+            assert sum(shares) == pytest.approx(1.0, abs=0.01) and max(shares) > 0.5
+            whole(page, 1280)
+            # The edge ends before the page would.
+            page.close()
