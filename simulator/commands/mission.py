@@ -49,8 +49,7 @@ class Create:
 def main(argv: list[str]) -> int:
     """Run ``aicvds mission``; returns the exit code."""
     if argv[:1] != ["create"]:
-        text = "usage: aicvds mission create --edge URL [--world FOLDER]\n\n`aicvds mission create --help` explains it."
-        print(text)
+        print("usage: aicvds mission create --edge URL [--world FOLDER]\n\n`aicvds mission create --help` explains it.")
         return 0 if argv[:1] in (["--help"], ["-h"]) else 2
     return command_main(Create, "aicvds mission create", argv[1:], create)
 

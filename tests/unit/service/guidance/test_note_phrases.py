@@ -50,6 +50,7 @@ def phrased(note: str) -> PhrasedNote:
         ("crew fixed 4, no need to go there anymore. Leave the rest as it is", ["visit:4"]),
         ("All good at sensor 4, nobody needs to go there. Everything else stays as it is.", ["visit:4"]),
         ("4 is fine again, we don't need to check on it", ["visit:4"]),
+        ("calib on 7 finished, treat it like the rest again", ["weight:7"]),
         ("scrap what I said about 4, rest stays the same", ["visit:4", "weight:4"]),
     ],
 )
@@ -257,6 +258,8 @@ def test_what_is_refused_leaves_the_rest() -> None:
         ),
         ("5 is repaired, we don't need to check it", {"weight:5": 0}, "5 is repaired"),
         ("the cap is gone, and keep moving", {"avoid:0": 0}, "the cap is gone"),
+        ("sensor 7 has new readings; somebody should stop by 5", {"weight:7": 5}, "sensor 7 has new readings"),
+        ("scrap what I asked for except the survey on 0 and 9", {"weight:0": 0, "weight:9": 0}, "scrap what i asked"),
     ],
 )
 def test_what_no_word_asks_for_is_in_no_order(note: str, read: dict[str, float], in_no_order: str) -> None:
