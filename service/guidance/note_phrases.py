@@ -145,8 +145,8 @@ class PhrasedNote:
             both = f"visit:{sensor}" in values and values.get(f"weight:{sensor}") == 0
             measured = value in periods if kind == "visit" else "_" not in kind or _uses(name, value, measures)
             if kind == "weight" and value and not whole and not re.search("doubl|twice|tripl", text):
-                named = [n.value for n in numbers if _has("named", text[: n.begin])].count(value)
-                measured = [n.value for n in numbers].count(value) > max(named, f"visit:{value:g}" in values)
+                spoken = [n.value for n in numbers if _has("named", text[: n.begin])].count(value)
+                measured = [n.value for n in numbers].count(value) > max(spoken, f"visit:{value:g}" in values)
             denied = near and all(any(_has(k, c) for k in against) for c in near)
             if both or denied or not measured or (kind == "avoid" and not near):
                 refused[name] = next(iter(near), " ".join(self.rest.split()))
