@@ -249,7 +249,7 @@ def test_what_is_refused_leaves_the_rest() -> None:
 @pytest.mark.parametrize(
     ("note", "read", "in_no_order"),
     [
-        # Nobody asks that every sensor is ignored, or weighs one by another's number.
+        # No words here ask to ignore every sensor, and no number is a weight.
         ("the crew was at 3", {f"weight:{j}": 0 for j in range(10)}, "the crew was at 3"),
         (
             "5 and 8 need a visit at least every 6 steps",
