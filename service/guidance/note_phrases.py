@@ -115,7 +115,7 @@ class PhrasedNote:
         ends |= {name: End(visited=int(name[6:])) for name in self._once}
         doubts = self._doubts + [f"In no order: “{words}”." for words in dict.fromkeys(refused.values()) if words]
         for match, kind, end in self._ends:
-            names = [n for n in values if n not in self._once and self._in_sentence(n, values[n], match.start())]
+            names = [n for n in values if n not in self._once and self._in_sentence(n, values, match.start())]
             for name in names if end is not None or kind == "visited" else ():
                 sensor = self._visited(match, name, values)
                 if (its := end if sensor is None else End(visited=sensor)) is not None:
@@ -218,7 +218,7 @@ class PhrasedNote:
         kind, _, number = name.partition(":")
         return int(number) if kind == "visit" else sensors.pop() if len(sensors) == 1 else None
 
-    def _in_sentence(self, name: str, value: float, at: int) -> bool:
+    def _in_sentence(self, name: str, values: Mapping[str, float], at: int) -> bool:
         """Whether an order's numbers are not only elsewhere than where an end at this place belongs.
 
         An end belongs to its sentence; to the words before it if no comma comes between them.
@@ -230,7 +230,8 @@ class PhrasedNote:
         ends = [match.span() for match, _, _ in self._ends]
         numbers = [n for n in numbers_of(self._lowered) if not any(begin <= n.begin < end for begin, end in ends)]
         before, around = ([n for n in numbers if b <= n.begin < e] for b, e in ((begin, at), sentence))
-        return _uses(name, value, before or around) or not _uses(name, value, numbers)
+        before = before if any(_uses(other, values[other], before) for other in values) else around
+        return _uses(name, values[name], before) or not _uses(name, values[name], numbers)
 
     def _unread(self, values: Mapping[str, float], used: Collection[float]) -> Iterator[str]:
         for clause in _CLAUSE.finditer(self.rest):

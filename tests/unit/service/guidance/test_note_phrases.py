@@ -51,6 +51,8 @@ def phrased(note: str) -> PhrasedNote:
         ("All good at sensor 4, nobody needs to go there. Everything else stays as it is.", ["visit:4"]),
         ("4 is fine again, we don't need to check on it", ["visit:4"]),
         ("calib on 7 finished, treat it like the rest again", ["weight:7"]),
+        ("Crew is at 4 now, drop the extra visits there.", ["visit:4"]),
+        ("sensor 4 has been swapped so stop the trips to it", ["visit:4"]),
         ("scrap what I said about 4, rest stays the same", ["visit:4", "weight:4"]),
     ],
 )
@@ -94,6 +96,9 @@ def test_what_a_phrase_might_misread_is_for_the_llm(note: str) -> None:
         ("At least 3 m/s.", "Never fly slower than 3 m/s."),
         ("Don't fly at 5 m/s.", "Never fly at 5 m/s."),
         ("Leave sensor 4 alone.", "Ignore what sensor 4 loses."),
+        ("Someone pop over to 4 once for a reading.", "Visit sensor 4 once, as soon as possible."),
+        ("Would be good to know: one of you, please go to sensor 4 once", "Visit sensor 4 once, as soon as possible."),
+        ("Somebody check 4 every 3 steps", f"{VISIT}."),
         ("Go to sensor 4 once.", "Visit sensor 4 once, as soon as possible."),
         ("Visit sensor 4 until it was visited.", "Visit sensor 4 once, as soon as possible."),
         ("Visit sensor 4 every 3 steps until step 40.", f"{VISIT}, until step 40."),
@@ -221,6 +226,12 @@ def test_one_visit_in_the_midst_of_a_sentence_is_read() -> None:
     note = phrased("They smell gas, so get a drone over to sensor 9 right away, just the once.")
     guidance, _ = note.completed(NO_GUIDANCE, ())
     assert guidance.in_words() == "Visit sensor 9 once, as soon as possible."
+
+
+def test_an_end_after_a_comma_belongs_to_the_order_before_it() -> None:
+    note = phrased("Sensor 2 matters most, count it triple until step 20")
+    guidance, doubts = note.completed(Guidance.of({"weight:2": 3}, {}), {2.0, 3.0})
+    assert (guidance.in_words(), doubts) == ("Count each packet that sensor 2 loses 3 times, until step 20.", [])
 
 
 def test_no_need_for_a_sensor_whose_visits_are_ordered_ends_them_alone() -> None:
