@@ -61,7 +61,8 @@ _UNITS = {
     "m²": r"m²",
 }
 _UNIT = re.compile(
-    rf"(?:(?<=half) an?)?[ -]?(?:{'|'.join(f'(?P<u{i}>{words})' for i, words in enumerate(_UNITS.values()))})(?![\w/])"
+    r"(?:(?<=half) an?(?= ))?[ -]?"
+    rf"(?:{'|'.join(f'(?P<u{i}>{words})' for i, words in enumerate(_UNITS.values()))})(?![\w/])"
 )
 
 

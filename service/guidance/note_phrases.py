@@ -57,9 +57,12 @@ class PhrasedNote:
         self.withdrawn: list[str] = []
         self.is_foreign = len(re.findall(_TABLE["foreign"]["words"], self._lowered)) > 1
         self._doubts: list[str] = []
+        self._quoted: list[str] = []
         self._once: dict[str, float] = {}
         self._ends: list[tuple[re.Match[str], str, End | None]] = []
         self._orders: list[tuple[str, re.Match[str]]] = []
+        for match in self._taken(_PHRASES["quoted"]):
+            self._quoted.append(re.sub(r",? (?:and|but)$", "", match[0].strip()))
         for row, patterns in _ROWS["withdraw"]:
             for match in self._taken(patterns, partial(self._withdraws, row, in_force)):
                 self.withdrawn += _names(row, match)
@@ -97,7 +100,11 @@ class PhrasedNote:
     @property
     def is_read(self) -> bool:
         """Whether the rest has nothing for the LLM to read."""
-        return self.orders and not numbers_of(self.rest) and not list(self._unread(self._read_orders().values, ()))
+        return (
+            (self.orders or not self.rest.strip(" .,;:!?"))
+            and not numbers_of(self.rest)
+            and not list(self._unread(self._read_orders().values, ()))
+        )
 
     def completed(self, read: Guidance, numbers: Collection[float]) -> tuple[Guidance, list[str]]:
         """The whole note's guidance, and doubts: what is in no order, and ends that no order can have.
@@ -111,9 +118,14 @@ class PhrasedNote:
         values = {**{n: v for n, v in read.values.items() if n not in refused}, **own.values, **self._once}
         if refused and not values and not self.withdrawn:
             raise BadOrders(f"“{next(iter(refused.values()))}” may end an order or mean a part of the fleet")
+        if self._quoted and not values and not self.withdrawn:
+            raise BadOrders(f"“{self._quoted[0]}” asks or has a condition, which is no order")
         ends = {name: end for name, end in read.ends.items() if name in values}
+        if not _has("always", self._lowered):
+            ends |= {n: End(visited=int(n[6:])) for n, v in read.values.items() if n[:5] == "visit" and v == 1}
         ends |= {name: End(visited=int(name[6:])) for name in self._once}
-        doubts = self._doubts + [f"In no order: “{words}”." for words in dict.fromkeys(refused.values()) if words]
+        refused_words = [*self._quoted, *filter(None, dict.fromkeys(refused.values()))]
+        doubts = self._doubts + [f"In no order: “{words}”." for words in refused_words]
         for match, kind, end in self._ends:
             names = [n for n in values if n not in self._once and self._in_sentence(n, values, match.start())]
             for name in names if end is not None or kind == "visited" else ():
@@ -148,6 +160,7 @@ class PhrasedNote:
                 spoken = [n.value for n in numbers if _has("named", text[: n.begin])].count(value)
                 measured = [n.value for n in numbers].count(value) > max(spoken, f"visit:{value:g}" in values)
             denied = near and all(any(_has(k, c) for k in against) for c in near)
+            denied = denied or (ignored and any(_has("said", c) for c in clauses))
             if both or denied or not measured or (kind == "avoid" and not near):
                 refused[name] = next(iter(near), " ".join(self.rest.split()))
             elif ignored and near and all(_has("lifts", c) for c in near):

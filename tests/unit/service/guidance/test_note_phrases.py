@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from datetime import UTC, datetime, timedelta
 
 import pytest
@@ -46,6 +47,8 @@ def phrased(note: str) -> PhrasedNote:
         ("Forget all the orders I gave you earlier", ["*"]),
         ("Lift the speed limit.", ["*_velocity", "avoid:*"]),
         ("Speed cap is off again.", ["*_velocity", "avoid:*"]),
+        ("Wind has dropped, so the speed cap can go.", ["max_velocity"]),
+        ("Honestly, who put that speed cap in?! Take it off, now.", ["max_velocity"]),
         ("speed limit dropped", ["*_velocity", "avoid:*"]),
         ("crew fixed 4, no need to go there anymore. Leave the rest as it is", ["visit:4"]),
         ("All good at sensor 4, nobody needs to go there. Everything else stays as it is.", ["visit:4"]),
@@ -69,7 +72,6 @@ def test_what_a_note_withdraws_is_read_whole(note: str, withdrawn: list[str]) ->
         "No need to visit sensor 5.",
         "Don't cancel all orders.",
         "Cancel all orders at step 40.",
-        "If the leak is closed, cancel all orders.",
         "Shall we cancel all orders?",
         "Drop sensor 4 from the tour.",
         "Never leave sensor 4 unvisited for more than 3 steps.",
@@ -223,9 +225,81 @@ def test_a_list_of_visits_with_one_verb_is_for_the_llm() -> None:
 
 
 def test_one_visit_in_the_midst_of_a_sentence_is_read() -> None:
-    note = phrased("They smell gas, so get a drone over to sensor 9 right away, just the once.")
-    guidance, _ = note.completed(NO_GUIDANCE, ())
-    assert guidance.in_words() == "Visit sensor 9 once, as soon as possible."
+    for note in (
+        "They smell gas, so get a drone over to sensor 9 right away, just the once.",
+        "If it is not too much trouble, one of them, any of them, could drop by sensor 9 just a single time",
+    ):
+        guidance, _ = phrased(note).completed(NO_GUIDANCE, ())
+        assert guidance.in_words() == "Visit sensor 9 once, as soon as possible."
+
+
+@pytest.mark.parametrize(
+    ("before", "quoted", "after"),
+    [
+        ("", "If the leak is closed, cancel all orders", ""),
+        ("", "Should the dust get thicker, hold everybody below 8 m/s", ""),
+        ("Max 9 m/s, and ", "in case it gets windy go down to 5", "."),
+        ("", "Send someone to sensor 4 if the alarm rings", ". Morning!"),
+        ("Quick one: ", "when did anybody look at 2, is it every 4 steps?", ""),
+        ("", "Is 4 still visited every 3 steps?", ""),
+    ],
+)
+def test_a_question_and_a_condition_are_quoted_and_not_read(before: str, quoted: str, after: str) -> None:
+    found = phrased(before + quoted + after)
+    assert (quoted.lower() in found.text.lower(), found.withdrawn) == (False, [])
+    if found.orders:
+        assert found.completed(NO_GUIDANCE, ())[1] == [f"In no order: “{quoted.lower()}”."]
+    else:
+        with pytest.raises(BadOrders, match=re.escape(f"“{quoted.lower()}” asks or has a condition")):
+            found.completed(NO_GUIDANCE, ())
+
+
+def test_half_as_much_is_no_time() -> None:
+    assert [(n.value, n.unit) for n in numbers_of("sensor 6 counts half as much, half a step, half an hour")] == [
+        (6, None),
+        (0.5, None),
+        (0.5, "steps"),
+        (0.5, "h"),
+    ]
+
+
+@pytest.mark.parametrize(
+    "note",
+    [
+        "If sensor 4 was not visited for 3 steps, go there.",
+        "If you could visit sensor 4 every 3 steps",
+        "How about a visit to sensor 4 every 3 steps?",
+        "If we lose data of sensor 4, it costs twice as much.",
+        "Could someone look at sensor 4 every 3 steps?",
+        "Go slower if they fly faster than 9 m/s, just in case.",
+    ],
+)
+def test_a_period_and_politeness_are_no_conditions(note: str) -> None:
+    assert not phrased(note).completed(NO_GUIDANCE, (3.0, 4.0, 9.0, 2.0))[1]
+
+
+def test_one_visit_that_the_llm_reads_as_many_ends_with_the_first() -> None:
+    once = phrased("Could somebody swing by 2 and 9? Just the once each.").completed(
+        Guidance.of({"visit:2": 1, "visit:9": 1}, {}), {2.0, 9.0}
+    )[0]
+    assert once.in_words() == ("Visit sensor 2 once, as soon as possible. Visit sensor 9 once, as soon as possible.")
+    always = phrased("Keep someone at sensor 4").completed(Guidance.of({"visit:4": 1}, {}), {4.0})[0]
+    assert always.in_words() == "Visit sensor 4 in every step."
+
+
+@pytest.mark.parametrize(
+    "note",
+    [
+        "They would be glad to see a UAV drop by sensor 4, a single time, then they leave us in peace.",
+        "The auditors want one fresh reading from sensor 4, that is all",
+        "Scrap everything I asked for, but not the triple weight on 5.",
+        "Forget what I told you apart from 5. From step 9 on someone at 4 every 3 steps.",
+    ],
+)
+def test_a_visit_or_a_withdrawal_ignores_no_sensor(note: str) -> None:
+    read = Guidance.of({"weight:4": 0}, {})
+    with pytest.raises(BadOrders, match="may end an order"):
+        phrased(note).completed(read, {4.0, 5.0})
 
 
 def test_an_end_after_a_comma_belongs_to_the_order_before_it() -> None:
