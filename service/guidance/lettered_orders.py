@@ -203,7 +203,10 @@ class _Orders:
         if number is None or number.unit not in METRES_A_SECOND:
             raise BadOrders("a velocity has no number in m/s, km/h, mph or knots")
         value = number.value * METRES_A_SECOND[number.unit]
-        return round(value) if abs(value - round(value)) <= _ROUNDING else rounded(value)
+        level = round(value) if abs(value - round(value)) <= _ROUNDING else rounded(value)
+        if level > self._scenario.max_velocity:
+            raise BadOrders(f"{level} m/s is above the fleet's top speed, {self._scenario.max_velocity} m/s")
+        return level
 
 
 def _whole(value: float) -> int:

@@ -28,7 +28,7 @@ ORDINALS = [
 _TENS = ["twenty", "thirty", "forty", "fifty", "sixty", "seventy", "eighty", "ninety"]
 # fmt: on
 # These words stay next to their letter: they carry more meaning than a number.
-_FACTORS = {"twice": 2.0, "double": 2.0, "doubly": 2.0, "triple": 3.0, "thrice": 3.0, "half": 0.5}
+_FACTORS = {"twice": 2.0, "double": 2.0, "doubly": 2.0, "triple": 3.0, "tripple": 3.0, "thrice": 3.0, "half": 0.5}
 _TELLING = {"zero": 0.0, "one": 1.0, "first": 1.0, "second": 2.0, "other": 2.0, "alternate": 2.0, **_FACTORS}
 
 

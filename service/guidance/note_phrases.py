@@ -158,17 +158,20 @@ class PhrasedNote:
             measured = value in periods if kind == "visit" else "_" not in kind or _uses(name, value, measures)
             if kind == "weight" and value and not whole and not re.search("doubl|twice|tripl", text):
                 spoken = [n.value for n in numbers if _has("named", text[: n.begin])].count(value)
-                measured = [n.value for n in numbers].count(value) > max(spoken, f"visit:{value:g}" in values)
+                own = f"visit:{value:g}" in values or value == int(sensor)
+                measured = [n.value for n in numbers].count(value) > max(spoken, own)
             denied = near and all(any(_has(k, c) for k in against) for c in near)
             denied = denied or (ignored and any(_has("said", c) for c in clauses))
             if both or denied or not measured or (kind == "avoid" and not near):
                 refused[name] = next(iter(near), " ".join(self.rest.split()))
-            elif ignored and near and all(_has("lifts", c) for c in near):
+            elif ignored and near and (all(_has("lifts", c) for c in near) or not _has("ignores", self._lowered)):
                 # "No need to visit it" ends the visits, and says nothing of what the sensor loses.
                 if f"visit:{sensor}" in self._in_force:
                     refused[name] = ""
                     self.withdrawn.append(f"visit:{sensor}")
-                elif any(_has("ended", c) for c in near):
+                elif any(_has("ended", c) for c in near) or any(
+                    _has("served", c) and _has("there", c) for c in clauses
+                ):
                     refused[name] = near[0]
         for kind in () if whole else ("visit", "weight"):
             named = [name for name in values if name.startswith(kind)]

@@ -138,7 +138,7 @@ def test_what_is_in_no_order_is_a_doubt() -> None:
         ("visit {0} every {1}; visit {0} every {3}", "ordered twice"),
         ("min {2}; min {3}", "ordered twice"),
         ("avoid {5}", "none of the velocities"),
-        ("max {6}", "max_velocity"),
+        ("max {6}", "top speed"),
         ("weigh {0} {6}", "weight"),
         ("visit {0}-{0} every {1}", "are no range"),
         ("max Ω", "is no number of the note"),

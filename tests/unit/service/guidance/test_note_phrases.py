@@ -47,6 +47,7 @@ def phrased(note: str) -> PhrasedNote:
         ("Forget all the orders I gave you earlier", ["*"]),
         ("Lift the speed limit.", ["*_velocity", "avoid:*"]),
         ("Speed cap is off again.", ["*_velocity", "avoid:*"]),
+        ("Sensor 7 got a new battery and counts again like all the others.", ["weight:7"]),
         ("Wind has dropped, so the speed cap can go.", ["max_velocity"]),
         ("Honestly, who put that speed cap in?! Take it off, now.", ["max_velocity"]),
         ("speed limit dropped", ["*_velocity", "avoid:*"]),
@@ -300,6 +301,33 @@ def test_a_visit_or_a_withdrawal_ignores_no_sensor(note: str) -> None:
     read = Guidance.of({"weight:4": 0}, {})
     with pytest.raises(BadOrders, match="may end an order"):
         phrased(note).completed(read, {4.0, 5.0})
+
+
+@pytest.mark.parametrize(
+    "note",
+    [
+        "Flange on 4 is tight again, those extra rounds to sensor 4 can stop.",
+        "The corner at sensor 4 is dry, you can stop with the regular flights to it.",
+        "4 has calmed down: it may wait now",
+    ],
+)
+def test_visits_that_may_stop_end_and_ignore_no_sensor(note: str) -> None:
+    found = phrased(note)
+    assert found.completed(Guidance.of({"weight:4": 0}, {}), {4.0})[0] == NO_GUIDANCE
+    assert found.withdrawn == ["visit:4"]
+
+
+def test_one_reading_ignores_no_sensor_without_a_word_that_does() -> None:
+    note = phrased("I have changed the valve at sensor 5. Take one reading from there, more is not needed.")
+    with pytest.raises(BadOrders, match="changed the valve"):
+        note.completed(Guidance.of({"weight:5": 0}, {}), {5.0})
+
+
+def test_a_sensors_own_number_is_no_weight() -> None:
+    read = Guidance.of({"weight:7": 7}, {})
+    with pytest.raises(BadOrders, match="worth a lot"):
+        phrased("Data from sensor 7 is worth a lot").completed(read, {7.0})
+    assert phrased("Data from sensor 7 has a weight of 7").completed(read, {7.0})[0] == read
 
 
 def test_an_end_after_a_comma_belongs_to_the_order_before_it() -> None:
