@@ -1,7 +1,8 @@
 # make install | demo | test | test-long | check | docs | bench | faults | fuzz | soak | compose | release | clean
 #
-# TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index: its "Get Started" selector
-# prints it after --index-url. Unset, torch comes from the ordinary index (on Linux the CUDA build).
+# TORCH_INDEX: for the tests and the laboratory, on a machine with the whole internet, the address of PyTorch's CPU index:
+# its "Get Started" selector prints it after --index-url. Unset, torch comes from the ordinary index (on Linux the CUDA
+# build).
 PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || echo python3)
 TORCH_INDEX ?=
 MINUTES ?= 10
@@ -38,7 +39,7 @@ install: .venv/installed
 
 # What serves, simulates and draws.
 .venv/demo: pyproject.toml constraints.txt install.py
-	$(PYTHON) install.py demo $(TORCH_INDEX:%=--torch-index %)
+	$(PYTHON) install.py demo
 	@touch $@
 
 demo: .venv/demo
@@ -46,7 +47,7 @@ demo: .venv/demo
 
 # In advance, because a test that waits for the compiler may run into a limit of time; a second once it is done.
 COMPILE = $(BIN)/python -c 'from service.edge.compilation import compile_all; compile_all()'
-# The variable is that of `aicvds serve`, here before torch is loaded: llama.cpp's threads share the cores with other
+# The variable is that of `aicvds serve`, here before llama.cpp is loaded: its threads share the cores with other
 # tests, and would spin while one waits for the other.
 # Three workers on two cores: many tests wait for processes, browsers and pauses. The long tests compute, and those that
 # start Ray's clusters ran out of patience beside two others.
@@ -101,7 +102,7 @@ compose:
 	tests/e2e/compose.sh
 
 release: install
-	$(BIN)/python release.py --images $(IMAGES) --build-network $(AICVDS_BUILD_NETWORK) $(TORCH_INDEX:%=--torch-index %)
+	$(BIN)/python release.py --images $(IMAGES) --build-network $(AICVDS_BUILD_NETWORK)
 
 clean:
 	rm -rf .venv build dist *.egg-info

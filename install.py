@@ -3,8 +3,8 @@
     python install.py demo      what `make demo` needs
     python install.py all       everything: tests, laboratory, documentation
 
-Both follow constraints.txt, and the machine's pip settings: indexes, find-links, constraints, certificates. On a
-machine with the whole internet, --torch-index is the address of PyTorch's CPU index.
+Both follow constraints.txt, and the machine's pip settings: indexes, find-links, constraints, certificates. Only the
+laboratory needs torch: on a machine with the whole internet, --torch-index is the address of PyTorch's CPU index.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ def main() -> int:
             venv.create(VENV, with_pip=True)
         installer = _pip() if args.pip else _uv() or _pip()
         print(f"Installing {args.what} into {VENV.name} by {installer.name}", flush=True)
-        torch = next(line for line in CONSTRAINTS.read_text().splitlines() if line.startswith("torch=="))
         if args.torch_index:
+            torch = next(line for line in CONSTRAINTS.read_text().splitlines() if line.startswith("torch=="))
             installer.install([torch], default_index=args.torch_index)
         # Commands that run from here would take the entry points of an earlier installation out of its egg-info.
         for stale in HERE.glob("*.egg-info"):
             shutil.rmtree(stale)
-        installer.install([torch, "--editable", f"{HERE}[{EXTRAS[args.what]}]"])
+        installer.install(["--editable", f"{HERE}[{EXTRAS[args.what]}]"])
         _prepare()
     except subprocess.CalledProcessError as failed:
         print(f"install.py: {failed.cmd[0]} ended with exit code {failed.returncode}; see above", file=sys.stderr)

@@ -53,8 +53,6 @@ class Release:
 
     images: Literal["auto", "required", "none"] = "auto"
     """Docker images: without an engine `auto` skips them and `required` fails; `none` builds none."""
-    torch_index: Annotated[str, tyro.conf.arg(metavar="URL")] = ""
-    """PyTorch's CPU index, for the clean environment and the edge's image; by default the ordinary index has torch."""
     build_network: Annotated[str, tyro.conf.arg(metavar="NAME")] = "default"
     """Network of the images' builds; `host` if they reach the package index only from the machine's own network."""
 
@@ -124,7 +122,7 @@ def release(version: str, options: Release, images: Sequence[str]) -> None:
         wheel = build_wheel(source)
         check_contents(wheel, source)
         step("the wheel in a clean environment")
-        python = clean_environment(wheel, options.torch_index, folder)
+        python = clean_environment(wheel, folder)
         try_installed(version, python, folder)
         step("SBOM")
         write_sbom(version, python, wheel.with_name(f"aic_vds-{version}.cdx.json"))
@@ -154,17 +152,15 @@ def check_contents(wheel: Path, source: Path) -> None:
         raise NotReleased(f"the wheel and git differ, see package-data in pyproject.toml: {sorted(packed ^ tracked)}")
 
 
-def clean_environment(wheel: Path, torch_index: str, folder: Path) -> Path:
+def clean_environment(wheel: Path, folder: Path) -> Path:
     """Install the wheel with all users' extras into a new virtual environment; returns its Python."""
     with zipfile.ZipFile(wheel) as archive:
         (metadata,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
         extras = set(parse_email(archive.read(metadata))[0]["provides_extra"]) - OWN_EXTRAS
     constraints = ROOT / "constraints.txt"
-    torch = next(line for line in constraints.read_text().splitlines() if line.startswith("torch=="))
     run(sys.executable, "-m", "venv", "--without-pip", folder / "venv")
     python = folder / "venv" / "bin" / "python"
     install = (sys.executable, "-m", "pip", "--python", python, "install", "--quiet")
-    run(*install, torch, *(("--index-url", torch_index) if torch_index else ()))
     run(*install, "--constraint", constraints, f"aic-vds[{','.join(sorted(extras))}] @ {wheel.as_uri()}")
     return python
 
@@ -201,8 +197,6 @@ def build_image(name: str, version: str, source: Path, options: Release) -> str:
     step(f"image {image}")
     labels = {"version": version, "revision": output("git", "rev-parse", "HEAD", cwd=source).strip()}
     arguments = {"VERSION": version}
-    if name == "edge" and options.torch_index:
-        arguments["TORCH_INDEX"] = options.torch_index
     command = ["docker", "build", "--file", str(source / "docker" / f"{name}.Dockerfile"), "--tag", image]
     command += ["--network", options.build_network]
     command += [f"--build-arg={key}={value}" for key, value in arguments.items()]

@@ -1,25 +1,15 @@
 # The edge: the decision service, its LLM and its token vocabulary. At run time it downloads nothing.
 #   docker build -f docker/edge.Dockerfile -t aicvds-edge .
 #   docker run --rm -p 127.0.0.1:8000:8000 -e AICVDS_ANONYMOUS=on aicvds-edge
-#
-# --build-arg TORCH_INDEX=…  the address of PyTorch's CPU index, as its "Get Started" selector prints it after
-#                            --index-url; without it torch comes from the ordinary index (on x86: the CUDA build,
-#                            gigabytes larger and no use here).
 
 FROM python:3.11-slim-bookworm AS dependencies
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore PATH=/opt/aicvds/bin:$PATH
 WORKDIR /src
 RUN python -m venv /opt/aicvds
-COPY constraints.txt ./
-# Only torch comes from its own index; its requirements come from the ordinary one, below.
-ARG TORCH_INDEX=""
-RUN pip install --no-deps ${TORCH_INDEX:+--index-url "$TORCH_INDEX"} "$(grep '^torch==' constraints.txt)"
-COPY pyproject.toml ./
+COPY constraints.txt pyproject.toml ./
 # Without the source, this installs an empty aic-vds with all its requirements, and the layer stays valid after every
-# edit of the source. Torch's C++ headers and test programs are a fifth of it, and the image needs none.
-RUN touch README.md LICENSE \
- && pip install --constraint constraints.txt '.[service,mqtt,otel,postgres]' \
- && cd /opt/aicvds/lib/python3.11/site-packages && rm -rf torch/include torch/test
+# edit of the source.
+RUN touch README.md LICENSE && pip install --constraint constraints.txt '.[service,mqtt,otel,postgres]'
 
 # Only these files, so that an edit elsewhere does not download the model again.
 FROM dependencies AS model
@@ -42,18 +32,16 @@ ARG VERSION=""
 RUN SETUPTOOLS_SCM_PRETEND_VERSION_FOR_AIC_VDS=$VERSION pip wheel --no-deps --wheel-dir /wheels .
 
 # This stage removes files that a running edge never opens, as docker/check_edge.py proves below:
-# - symbol tables of shared libraries (237 MB: 89 torch's, 80 llama.cpp's), which only debuggers need. The libraries in
+# - symbol tables of shared libraries (some 150 MB, 80 llama.cpp's), which only debuggers need. The libraries in
 #   *.libs stay: their wheels rearranged them, and strip breaks them;
-# - the packages' own tests (90 MB);
-# - torch's compiled tests and protoc (52 MB). Torch does not start without torch_shm_manager.
+# - the packages' own tests.
 # Bytecode (__pycache__, 165 MB) stays: with a read-only root every start would compile it again.
 FROM dependencies AS slim
 RUN apt-get update -q && apt-get install -y -q --no-install-recommends binutils
 RUN python -m pip uninstall --quiet --yes pip \
  && cd /opt/aicvds/lib/python3.11/site-packages \
  && find . -type f \( -name '*.so' -o -name '*.so.*' \) ! -path './*.libs/*' -exec strip --strip-unneeded {} + \
- && find . -type d -name tests -prune -exec rm -rf {} + \
- && find torch/bin -type f ! -name torch_shm_manager -delete
+ && find . -type d -name tests -prune -exec rm -rf {} +
 
 # The layers go from the largest and most stable to the smallest: an edit of the source ships kilobytes.
 FROM python:3.11-slim-bookworm

@@ -1,4 +1,4 @@
-# The simulator: the UAVs and the world, without torch. It reaches an edge over HTTP and writes a run's folder.
+# The simulator: the UAVs and the world. It reaches an edge over HTTP and writes a run's folder.
 #   docker build -f docker/simulator.Dockerfile -t aicvds-simulator .
 #   docker run --rm --network host -v aicvds-runs:/runs aicvds-simulator \
 #     aicvds simulate --edge http://127.0.0.1:8000 --out /runs/first

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import hypothesis
 import pytest
 import torch
 from httpx._config import create_ssl_context
@@ -37,8 +38,11 @@ os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# As in an edge: pytest's workers already take every core.
+# Pytest's workers already take every core.
 torch.set_num_threads(1)
+# A busy machine makes no example wrong.
+hypothesis.settings.register_profile("tests", deadline=None)
+hypothesis.settings.load_profile("tests")
 
 # Set where the tests must be complete, as in CI: a test whose program is missing then fails.
 _COMPLETE = "TESTS_COMPLETE"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -90,7 +91,8 @@ class Modules(nn.Module):
         with torch.random.fork_rng(devices=[]):
             self.attention = Attention(FEATURES[preset])
             self.velocity = VelocityScorer(levels) if preset == "paper" else ReachVelocityScorer(LEVEL_FEATURES)
-        self.load_state_dict(initial_parameters(init, preset, levels, seed))
+        own = initial_parameters(init, preset, levels, seed)
+        self.load_state_dict({name: torch.tensor(value) for name, value in own.items()})
 
     def evaluate(self, sample: Sample) -> tuple[Tensor, Tensor]:
         """Scores ``(n,)`` of the sensors, and values ``(levels,)`` of the velocities for the chosen sensor."""
@@ -109,4 +111,6 @@ class Modules(nn.Module):
 
     def save(self, path: Path) -> None:
         """Write the weights with the name of their feature preset."""
-        torch.save({"features": self.preset, "weights": self.state_dict()}, path)
+        weights = {name: value.numpy() for name, value in self.state_dict().items()}
+        with path.open("wb") as file:
+            np.savez(file, features=np.array(self.preset), **weights)

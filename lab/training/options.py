@@ -19,7 +19,7 @@ class Pretrain:
 
     Record first:  python -m lab explore --workers 2 --out runs/rollouts.jsonl.gz
 
-    Then:  python -m lab pretrain runs/rollouts.jsonl.gz --features reach --out runs/reach.pt
+    Then:  python -m lab pretrain runs/rollouts.jsonl.gz --features reach --out runs/reach.npz
 
     Several files train on several scenarios, every decision with the same weight. Their UAVs need the same velocities.
 
@@ -36,7 +36,7 @@ class Pretrain:
     rollouts: Annotated[tyro.conf.Positional[tuple[Path, ...]], arg(metavar="FILE FILE...")]
     """What `python -m lab explore` wrote, one file or more."""
     out: Annotated[Path, arg(metavar="FILE")]
-    """Checkpoint to write. The package's own are service/checkpoints/paper.pt and reach.pt, one a feature preset."""
+    """Checkpoint to write. The package's own are service/checkpoints/paper.npz and reach.npz, one a feature preset."""
     features: Features = "paper"
     """The modules' inputs: the paper's five numbers a sensor, or also the reach along the trajectory."""
     belief: Belief | None = None

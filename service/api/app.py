@@ -6,7 +6,6 @@ from contextlib import asynccontextmanager
 from importlib.metadata import version
 from typing import TypedDict
 
-import torch
 from fastapi import FastAPI
 
 from service.api import live_routes, problem_details
@@ -51,8 +50,6 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[RequestState]:
-        # One thread computes the small modules faster than it can start others, and llama.cpp needs the other cores.
-        torch.set_num_threads(1)
         metrics = Metrics()
         llm = ServerPool(settings, warm_up(settings), metrics.llm_breaker_opened.inc)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)

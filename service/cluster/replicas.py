@@ -91,7 +91,7 @@ class Owner:
 
 
 def _application(settings: Settings) -> FastAPI:
-    # The ingress imports this module too, and needs no torch.
+    # The ingress imports this module too, and needs no application.
     from service.api.app import create_app
     from service.storage.store import Store
 

@@ -199,9 +199,8 @@ def _timed(found: Examination, deadline_ms: int) -> str:
         cached = f" ({found.cached_tokens} cached)" if found.cached_tokens is not None else ""
         read = found.prompt_tokens - (found.cached_tokens or 0)
         rate = (read + found.completion_tokens) / max(found.seconds, 1e-3)
-        tokens = (
-            f"; prompt {found.prompt_tokens} tokens{cached}, answer {found.completion_tokens}, {rate:,.0f} a second"
-        )
+        count = f"prompt {found.prompt_tokens} tokens{cached}, answer {found.completion_tokens}"
+        tokens = f"; {count}, {rate:,.0f} a second"
     return f"a decision took {found.seconds:.2f} s of the deadline's {deadline_ms / 1e3:g} s{tokens}"
 
 

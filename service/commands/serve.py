@@ -69,7 +69,7 @@ class ServeOptions:
 def main(argv: list[str]) -> int:
     """Serve until SIGTERM (exit code 0) or Ctrl-C; returns the exit code."""
     # GNU OpenMP's threads spin at llama.cpp's barriers, even while another process has the core that they wait for. The
-    # library reads this variable once, when torch loads it.
+    # library reads this variable once, when llama.cpp loads it.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     args = tyro.cli(ServeOptions, prog="aicvds serve", args=argv)
     if _logs_json():
@@ -97,7 +97,7 @@ def main(argv: list[str]) -> int:
     # uvicorn raises the signal again once it has ended.
     on_sigterm = signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     try:
-        # The system queues requests from here on. /healthz answers immediately, the other routes once torch is loaded.
+        # The system queues requests from here on. /healthz answers at once, the other routes once all is loaded.
         _say(f"aicvds serve: listening on {url}, loading")
         # Nearly every object made while loading stays, and collecting garbage would take a tenth of the time.
         gc.disable()
@@ -192,7 +192,7 @@ def _bounds(replicas: str) -> tuple[int, int] | None:
 
 
 def _application(settings: Settings, url: str, loaded: Callable[[str], None]) -> FastAPI:
-    """Import torch and make the edge; raises ``_Unusable``."""
+    """Import the application and make the edge; raises ``_Unusable``."""
     from service.api.api_keys import BadKeys
     from service.api.app import create_app
     from service.commands.banner import banner

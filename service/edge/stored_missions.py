@@ -55,8 +55,7 @@ class StoredMissions:
         self._on_load = on_load
         self._on_drop = on_drop
         self._under_way: dict[str, asyncio.Task[None]] = {}
-        # A separate thread, so that a hanging store delays no decision; a single one, because torch has one generator
-        # for initial weights.
+        # A separate thread, so that a hanging store delays no decision.
         self._reading = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reader")
         self.ownership: LeasedOwnership | SoleOwnership = SoleOwnership()
         if store.leases is None:

@@ -1,65 +1,70 @@
 """A mission's initial weights: those that ship with the package, or random ones."""
 
+import math
 from functools import cache
 from importlib.resources import files
 
-import torch
-from torch import Tensor, nn
+import numpy as np
 
 from service.learning.modules import WIDTH, Weights
+from service.learning.softmax_means import Array
 from shared.features.augmented_state import FEATURES, LEVEL_FEATURES
 from shared.wire.schemas import Features, Init
 
 # The weights of preset `paper` by velocity level; preset `reach` has none.
-_LEVEL_TENSORS = ("velocity.out.weight", "velocity.out.bias")
+_LEVEL_ARRAYS = ("velocity.out.weight", "velocity.out.bias")
 
 
 def initial_weights(init: Init, preset: Features, levels: int, seed: int) -> Weights:
     """The weights of :func:`initial_parameters`; all missions share the pretrained ones."""
-    return _pretrained(preset, levels) if init == "pretrained" else _weights(init, preset, levels, seed)
+    if init == "pretrained":
+        return _pretrained(preset, levels)
+    return Weights.of(preset, initial_parameters(init, preset, levels, seed))
 
 
-def initial_parameters(init: Init, preset: Features, levels: int, seed: int) -> dict[str, Tensor]:
+def initial_parameters(init: Init, preset: Features, levels: int, seed: int) -> dict[str, Array]:
     """Parameters by name, in the modules' order, for velocities 0..levels - 1, pretrained, or random by seed.
 
     The shipped weights have 0..14 m/s; a scenario with a lower limit uses the first levels.
     """
     if init == "random":
         return _random(preset, levels, seed)
-    return {k: v[:levels] if preset == "paper" and k in _LEVEL_TENSORS else v for k, v in _packaged(preset).items()}
+    return {k: v[:levels] if preset == "paper" and k in _LEVEL_ARRAYS else v for k, v in _packaged(preset).items()}
 
 
 @cache
 def _pretrained(preset: Features, levels: int) -> Weights:
-    return _weights("pretrained", preset, levels, seed=0)
+    return Weights.of(preset, initial_parameters("pretrained", preset, levels, seed=0))
 
 
-def _weights(init: Init, preset: Features, levels: int, seed: int) -> Weights:
-    return Weights.of(preset, {k: v.numpy() for k, v in initial_parameters(init, preset, levels, seed).items()})
-
-
-def _random(preset: Features, levels: int, seed: int) -> dict[str, Tensor]:
-    """As torch draws the parameters of linear layers; its own generator does not change."""
+def _random(preset: Features, levels: int, seed: int) -> dict[str, Array]:
+    """As torch's linear layers draw theirs after the same seed, bit for bit: uniform within ``1 / sqrt(inputs)``."""
     features = FEATURES[preset]
     level_features, outputs = (1, levels) if preset == "paper" else (LEVEL_FEATURES, 1)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        layers = {
-            "attention.query": nn.Linear(features, WIDTH, bias=False),
-            "attention.key": nn.Linear(features, WIDTH, bias=False),
-            "attention.value": nn.Linear(features, WIDTH, bias=False),
-            "attention.score": nn.Linear(WIDTH, 1),
-            "velocity.hidden": nn.Linear(WIDTH + level_features, WIDTH),
-            "velocity.out": nn.Linear(WIDTH, outputs),
-        }
-    return {f"{name}.{key}": p for name, layer in layers.items() for key, p in layer.state_dict().items()}
+    shapes: dict[str, tuple[int, ...]] = {
+        **{f"attention.{name}.weight": (WIDTH, features) for name in ("query", "key", "value")},
+        "attention.score.weight": (1, WIDTH),
+        "attention.score.bias": (1,),
+        "velocity.hidden.weight": (WIDTH, WIDTH + level_features),
+        "velocity.hidden.bias": (WIDTH,),
+        "velocity.out.weight": (outputs, WIDTH),
+        "velocity.out.bias": (outputs,),
+    }
+    # Of the seed, torch uses 32 bits; of each number, as many bits as a float32 has digits.
+    twister = np.random.RandomState(seed % 2**32)
+    parameters, limit = {}, 0.0
+    for name, shape in shapes.items():
+        if len(shape) == 2:
+            limit = float(np.float32(1 / math.sqrt(shape[1])))
+        bits = twister.randint(0, 2**32, shape, dtype=np.uint32) % 2**24
+        parameters[name] = (bits / 2**24 * (2 * limit) - limit).astype(np.float32)
+    return parameters
 
 
 @cache
-def _packaged(preset: Features) -> dict[str, Tensor]:
-    with files("service").joinpath("checkpoints", f"{preset}.pt").open("rb") as file:
-        checkpoint = torch.load(file, weights_only=True)
-    if checkpoint["features"] != preset:
-        raise ValueError(f"checkpoints/{preset}.pt has modules of the feature preset {checkpoint['features']}")
-    weights: dict[str, Tensor] = checkpoint["weights"]
+def _packaged(preset: Features) -> dict[str, Array]:
+    with files("service").joinpath("checkpoints", f"{preset}.npz").open("rb") as file, np.load(file) as checkpoint:
+        weights = dict(checkpoint)
+    if (own := weights.pop("features").item()) != preset:
+        raise ValueError(f"checkpoints/{preset}.npz has modules of the feature preset {own}")
     return weights

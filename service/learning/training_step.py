@@ -27,9 +27,7 @@ class Moments:
 def adam_step(weights: Array, moments: Moments, gradient: Array, learning_rate: float) -> Array:
     """The weights ``(n,)`` after one more step of Adam (Kingma and Ba 2015) down the gradient ``(n,)``.
 
-    The result equals that of ``torch.optim.Adam`` but for the last bits. That class imports torch's compiler at its
-    first use, which blocks the process for seconds, and updates parameter by parameter. This function changes the
-    moments.
+    The result equals that of ``torch.optim.Adam`` but for the last bits. This function changes the moments.
 
     Raises:
         FloatingPointError: the gradient is not finite; the moments do not change.

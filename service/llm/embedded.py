@@ -7,8 +7,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import xllamacpp
-
 from service.config.settings import Settings
 from service.llm.adapter_version import DECISIONS, ORDERS, check_adapter
 from service.llm.model_file import embedded_model
@@ -20,7 +18,7 @@ _BATCH = 128
 
 
 class LoadFailed(RuntimeError):
-    """llama.cpp cannot load the model file."""
+    """llama.cpp cannot be loaded, or cannot load the model file."""
 
 
 class EmbeddedServer:
@@ -42,7 +40,7 @@ class EmbeddedServer:
         bare_model, model, notes_model: names of the model without an adapter, with the decisions' and with the orders'.
 
     Raises:
-        LoadFailed: llama.cpp could not load the file.
+        LoadFailed: llama.cpp could not be loaded, or could not load the file.
     """
 
     def __init__(
@@ -55,6 +53,11 @@ class EmbeddedServer:
         adapter: Path | None = None,
         orders: Path | None = None,
     ) -> None:
+        try:
+            # Here, because an edge with an LLM server has no use for it.
+            import xllamacpp
+        except ImportError as error:
+            raise LoadFailed(f"llama.cpp cannot be loaded: {error}; Debian has libgomp.so.1 in libgomp1") from error
         params = xllamacpp.CommonParams()
         params.model.path = str(gguf)
         params.cpuparams.n_threads = threads
@@ -78,7 +81,7 @@ class EmbeddedServer:
         self.api_key = secrets.token_urlsafe(24)
         params.api_keys = [self.api_key]
         try:
-            self._server: xllamacpp.Server | None = xllamacpp.Server(params)
+            self._server: Any = xllamacpp.Server(params)
         except RuntimeError as error:
             files = " with ".join([gguf.name, *(path.name for path in loaded)])
             raise LoadFailed(f"llama.cpp cannot load {files}: {error}") from error

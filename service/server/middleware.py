@@ -1,6 +1,6 @@
 """The server's wrappers of the application: security headers, and the gate while the edge loads.
 
-This module imports nothing slow such as torch.
+This module imports nothing slow such as FastAPI.
 """
 
 import asyncio
@@ -147,8 +147,7 @@ class StartupGate:
             app = await asyncio.to_thread(self._load)
             async with app.router.lifespan_context(app) as state:
                 self.app, self._state = app, state or {}
-                # A million objects of torch and other libraries live as long as the process. Freezing them saves a
-                # tenth of a second in each full collection.
+                # The libraries' objects live as long as the process. Freezing them saves time in each full collection.
                 gc.freeze()
                 gc.enable()
                 # Python runs a full collection when new objects exceed a quarter of those in the last one: few from now

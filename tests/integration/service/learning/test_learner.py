@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from lab.training.modules import Modules
-from service.learning.initial_weights import initial_weights
+from service.learning.initial_weights import initial_parameters, initial_weights
 from service.learning.learner import Learner
-from service.learning.modules import Sample
+from service.learning.modules import WIDTH, Sample
 from service.learning.training_step import descend
 from shared.features.augmented_state import FEATURES, LEVEL_FEATURES
 from shared.wire.schemas import Features
@@ -202,23 +202,35 @@ def test_a_decision_never_sees_half_a_step() -> None:
         assert tuple(in_hand.attend(features).scores.tolist()) == before
 
 
-def test_nothing_brings_torchs_compiler_into_the_process() -> None:
-    # Its import takes seconds, on a busy machine longer than a decision may.
+def test_an_edge_decides_and_learns_without_torch_and_llama_cpp() -> None:
+    # Their imports take seconds, and hundreds of megabytes.
     script = (
-        "import sys; from service.mission.mission import Mission; from service.config.settings import Settings;"
-        "from shared.wire.schemas import MissionSpec;"
-        "from tests.integration.service.learning.test_learner import sample;"
-        "Mission('m', MissionSpec(), Settings()).learner.update(sample('reach'), 0.3);"
-        "print([m for m in ('torch._dynamo', 'torch._inductor', 'sympy') if m in sys.modules])"
+        "import sys; sys.modules['torch'] = sys.modules['xllamacpp'] = None;"
+        "import service.api.app;"
+        "from service.learning.initial_weights import initial_weights; from service.learning.learner import Learner;"
+        "from service.learning.modules import WIDTH, Sample; import numpy as np;"
+        "sample = Sample(np.ones((6, 5), np.float32), 2, np.ones(1, np.float32), 7);"
+        "[Learner(initial_weights(init, 'paper', 15, 0), learning_rate=1e-3).update(sample, 0.3)"
+        " for init in ('pretrained', 'random')]"
     )
-    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == "[]"
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
 
 
-def test_the_seed_decides_the_initial_weights_and_leaves_torch_alone() -> None:
-    state = torch.random.get_rng_state()
-    a, b, c = Modules("paper", 15, seed=1), Modules("paper", 15, seed=1), Modules("paper", 15, seed=2)
-    assert torch.equal(torch.random.get_rng_state(), state)
-    scores = [m.weights().attend(sample().features).scores for m in (a, b, c)]
-    assert np.array_equal(scores[0], scores[1])
-    assert not np.array_equal(scores[0], scores[2])
+@pytest.mark.parametrize("seed", [0, 1, 2**32 + 5, 2**63 - 1])
+@pytest.mark.parametrize(("preset", "added", "outputs"), [("paper", 1, 15), ("reach", LEVEL_FEATURES, 1)])
+def test_random_weights_are_those_of_torchs_layers(preset: Features, added: int, outputs: int, seed: int) -> None:
+    features = FEATURES[preset]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        layers = [torch.nn.Linear(features, WIDTH, bias=False) for _ in range(3)]
+        layers += [torch.nn.Linear(*shape) for shape in ((WIDTH, 1), (WIDTH + added, WIDTH), (WIDTH, outputs))]
+    drawn = initial_parameters("random", preset, 15, seed).values()
+    for ours, theirs in zip(drawn, (p for layer in layers for p in layer.parameters()), strict=True):
+        assert np.array_equal(ours, theirs.detach().numpy())
+
+
+def test_the_seed_decides_the_initial_weights() -> None:
+    a, b, c = (initial_weights("random", "paper", 15, seed) for seed in (1, 1, 2))
+    assert np.array_equal(a.flat, b.flat)
+    assert not np.array_equal(a.flat, c.flat)
