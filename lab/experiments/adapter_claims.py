@@ -52,6 +52,6 @@ EXPERIMENT = Experiment(
     notes=(
         "Rows are shuffled; neither planner, verifier nor critic takes part. The rows show what the fleet's belief and "
         "its learned links foresee, which the paper's rows do not.",
-        "The adapter was trained on five rows with four velocities each. With more than five rows each has two.",
+        "The adapter was trained on 1 to 10 rows: up to five have four velocities each, more have two.",
     ),
 )

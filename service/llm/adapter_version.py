@@ -19,8 +19,6 @@ class Version(NamedTuple):
 
 # The version of the compact prompt; it changes whenever a text of that prompt does.
 PROMPT_VERSION = 3
-# The sensors of each prompt in training: the service's default ``top_k``.
-TRAINED_ROWS = 5
 DECISIONS = Version("aicvds.prompt_version", PROMPT_VERSION, "AICVDS_LLM_ADAPTER", "python -m lab distill")
 # The version of the form in which the adapter reads notes and writes orders.
 ORDERS = Version("aicvds.orders_version", 1, "AICVDS_LLM_ORDERS", "python -m lab distill-orders")

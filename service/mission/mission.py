@@ -93,8 +93,6 @@ class Mission:
         self.prompt_fits = not spec.uses_llm or self.prompt_fit.fits()
         if spec.uses_llm and not restored:
             self.prompt_fit.check()
-            if warning := self.prompt_fit.warning():
-                log.warning("mission %s: %s", mission_id, warning)
         self.experiences = Experiences(spec.prompt.experiences, spec.prompt.selection, self.scenario.uavs)
         self.decisions = 0
         self.feedback = 0

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 from service.config.settings import Settings, prompt_tokens
 from service.errors import Refused
-from service.llm.adapter_version import TRAINED_ROWS
 from service.llm.request_bodies import WarmUp
 from service.mission.resolved_spec import ResolvedSpec
 from service.prompting.compact_prompt import CompactTemplate
@@ -61,15 +60,6 @@ class PromptFit:
             "prompt",
             f"{style.experiences} experiences and {self._rows} sensors as {style.format} need up to {self._needed()} "
             f"tokens and AICVDS_LLM_CONTEXT is {self.context}: raise it, or lower prompt.experiences or top_k",
-        )
-
-    def warning(self) -> str | None:
-        """Why these prompts make the LLM's decisions worse; None if they do not."""
-        if not self._compact or self._rows <= TRAINED_ROWS:
-            return None
-        return (
-            f"its prompts have {self._rows} sensors, and the adapter was trained on {TRAINED_ROWS}: "
-            f"the LLM decides far better with attention and top_k {TRAINED_ROWS}"
         )
 
     def _needed(self, uavs: int = 1) -> int:

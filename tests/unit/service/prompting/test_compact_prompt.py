@@ -177,23 +177,6 @@ def test_an_llm_without_the_adapter_is_not_asked_in_it() -> None:
     assert not again.prompt_fits
 
 
-@pytest.mark.parametrize(
-    ("spec", "sensors"),
-    [({}, None), ({"top_k": 7}, 7), ({"attention": "off"}, 10), ({"mode": "value", "top_k": 7}, None)],
-)
-def test_more_sensors_than_the_adapter_was_trained_on_are_logged(
-    spec: dict[str, object], sensors: int | None, caplog: pytest.LogCaptureFixture
-) -> None:
-    made = Mission("test", MissionSpec.model_validate(spec), ADAPTED)
-    logged = [record.getMessage() for record in caplog.records]
-    assert [re.findall(r"mission test: its prompts have (\d+) sensors", text) for text in logged] == (
-        [[str(sensors)]] if sensors else []
-    )
-    caplog.clear()
-    Mission("test", MissionSpec.model_validate(spec), ADAPTED, made.spec)
-    assert not caplog.records
-
-
 def test_it_is_about_one_uav() -> None:
     fit = Mission("test", MissionSpec(mode="guided"), ADAPTED).prompt_fit
     assert fit.fits(1)
