@@ -258,7 +258,7 @@ if found := [name for name in sys.argv[1:] if find_spec(name)]:
 if getuid() == 0:
     sys.exit("FAIL: runs as root")' "${@:2}"
 }
-lacks "$edge_image" simulator gymnasium matplotlib pip
+lacks "$edge_image" simulator gymnasium matplotlib torch pip
 lacks "$simulator_image" service torch scipy xllamacpp pip
 settings=$(docker run --rm --network none --entrypoint python "$edge_image" -c '
 from service.config.settings import Settings
@@ -329,9 +329,8 @@ say "stopped while still starting: $result"
 
 # --- sizes -----------------------------------------------------------------------------------------------------------
 size() { docker image inspect --format '{{.Size}}' "$1"; }
-readonly BASE=python:3.11-slim-bookworm EDGE_MB=1200 SIMULATOR_MB=200
-# The edge's is for torch's CPU build: with the CUDA build, which the ordinary index brings on x86 (see TORCH_INDEX), it
-# is gigabytes more. BuildKit keeps the base image to itself.
+readonly BASE=python:3.11-slim-bookworm EDGE_MB=800 SIMULATOR_MB=200
+# BuildKit keeps the base image to itself.
 size "$BASE" >/dev/null 2>&1 || quietly docker pull "$BASE"
 base=$(size "$BASE")
 beyond() { # name, image, most: see that it adds less than so many MB to the base image
