@@ -52,12 +52,12 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[RequestState]:
         metrics = Metrics()
         llm = ServerPool(settings, warm_up(settings), metrics.llm_breaker_opened.inc)
-        counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
+        vocabulary = asyncio.to_thread(TokenCounter, settings.cache_dir)
+        counter, _ = await asyncio.gather(vocabulary, asyncio.to_thread(load_for_event_loop))
         engine = Engine(settings, llm, counter, metrics, traces, store)
         app.state.engine = engine
         llm.start()
         try:
-            await asyncio.to_thread(load_for_event_loop)
             yield {"engine": engine, "llm": llm, "metrics": metrics, "keys": keys}
         finally:
             may_close = await engine.close()
