@@ -229,6 +229,7 @@ def test_one_visit_in_the_midst_of_a_sentence_is_read() -> None:
     for note in (
         "They smell gas, so get a drone over to sensor 9 right away, just the once.",
         "If it is not too much trouble, one of them, any of them, could drop by sensor 9 just a single time",
+        "Could one of the drones check on sensor 9 just the one time? Whenever it fits.",
     ):
         guidance, _ = phrased(note).completed(NO_GUIDANCE, ())
         assert guidance.in_words() == "Visit sensor 9 once, as soon as possible."
