@@ -77,8 +77,7 @@ class KeyFile(BaseModel):
             raise BadKeys(str(error)) from None
         except ValidationError as error:
             fault = error.errors()[0]
-            at = ".".join(map(str, fault["loc"])) or "the file"
-            raise BadKeys(f"{path}: {at}: {problem_of(fault)}") from None
+            raise BadKeys(f"{path}: {'.'.join(map(str, fault['loc'])) or 'the file'}: {problem_of(fault)}") from None
 
     def write(self, path: Path) -> None:
         """Replace the file atomically, readable only by its owner; raises ``BadKeys``.

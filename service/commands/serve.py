@@ -92,8 +92,7 @@ def main(argv: list[str]) -> int:
     except OSError as error:
         other = "; choose another --port, or 0 for a free one" if settings.port else ""
         return _refused(f"cannot listen on {settings.host}:{settings.port}: {error.strerror or error}{other}")
-    host = f"[{settings.host}]" if ":" in settings.host else settings.host
-    url = f"http://{host}:{listener.getsockname()[1]}"
+    url = f"http://{f'[{settings.host}]' if ':' in settings.host else settings.host}:{listener.getsockname()[1]}"
     # uvicorn raises the signal again once it has ended.
     on_sigterm = signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     try:

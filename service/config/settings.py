@@ -46,8 +46,7 @@ def prompt_tokens(row_format: PromptFormat, rows: int, experiences: int, feature
 
 
 def _default_store() -> str:
-    home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
-    return str(home / "aicvds" / "missions.db")
+    return str(Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state", "aicvds", "missions.db"))
 
 
 def _json_object(value: object) -> object:

@@ -196,8 +196,7 @@ class Engine:
         clear_contextvars()
         # Every log line of the request has these fields.
         bind_contextvars(mission_id=request.mission_id, step=request.step)
-        milliseconds = request.deadline_ms or self._settings.deadline_ms
-        return watch, Deadline(watch.started + milliseconds / 1e3)
+        return watch, Deadline(watch.started + (request.deadline_ms or self._settings.deadline_ms) / 1e3)
 
     async def _decide_one(
         self, mission: Mission, request: DecideRequest, watch: Stopwatch, deadline: Deadline

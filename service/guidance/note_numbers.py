@@ -61,8 +61,7 @@ _UNITS = {
     "m²": r"m²",
 }
 _UNIT = re.compile(
-    r"(?:(?<=half) an?(?= ))?[ -]?"
-    rf"(?:{'|'.join(f'(?P<u{i}>{words})' for i, words in enumerate(_UNITS.values()))})(?![\w/])"
+    rf"(?:(?<=half) an?\b)?[ -]?(?:{'|'.join(f'(?P<u{i}>{unit})' for i, unit in enumerate(_UNITS.values()))})(?![\w/])"
 )
 
 

@@ -124,8 +124,7 @@ class PhrasedNote:
         if not _has("always", self._lowered):
             ends |= {n: End(visited=int(n[6:])) for n, v in read.values.items() if n[:5] == "visit" and v == 1}
         ends |= {name: End(visited=int(name[6:])) for name in self._once}
-        refused_words = [*self._quoted, *filter(None, dict.fromkeys(refused.values()))]
-        doubts = self._doubts + [f"In no order: “{words}”." for words in refused_words]
+        doubts = self._doubts + [f"In no order: “{w}”." for w in (*self._quoted, *filter(None, refused.values()))]
         for match, kind, end in self._ends:
             names = [n for n in values if n not in self._once and self._in_sentence(n, values, match.start())]
             for name in names if end is not None or kind == "visited" else ():
@@ -135,7 +134,9 @@ class PhrasedNote:
             if kind != "open" and not any(name in ends for name in names):
                 doubts.append(f"No order ends by itself “{match[0].strip()}”: withdraw it then.")
         sensors = (float(name[6:]) for name in own.values if name.startswith("visit:"))
-        doubts += [f"In no order: “{clause}”." for clause in self._unread(values, {*numbers, *sensors})]
+        doubts += [
+            f"In no order: “{clause}”." for clause in self._unread(values, {*(numbers if values else ()), *sensors})
+        ]
         return Guidance.of(values, ends), list(dict.fromkeys(doubts))
 
     def _refused(self, values: Mapping[str, float]) -> dict[str, str]:
@@ -204,8 +205,8 @@ class PhrasedNote:
         def letters(match: re.Match[str], part: str) -> str:
             begin, end = match.span(part)
             found = [letter for letter, number in note.numbers.items() if begin <= number.begin < end]
-            spans = re.search(r"\d ?- ?\d| to | through ", match[part])
-            return ("-" if spans and len(found) == 2 else " ").join(found)
+            spans = len(found) == 2 and re.search(r"\d ?- ?\d| to | through ", match[part])
+            return ("-" if spans else " ").join(found)
 
         answer = []
         for means, match in self._orders:

