@@ -84,7 +84,7 @@ def warm_up(settings: Settings) -> WarmUp:
     paper = SCENARIOS["paper"]
     if settings.adapted:
         compact = CompactTemplate(paper, rows=settings.top_k)
-        return WarmUp(compact.static, "999999U9a9999999A", compact.labels)
+        return WarmUp(compact.static, "963458U9h0998009A7d4798089E7e4000009I7c4007009M7a4005009Q", compact.labels)
     if settings.mode == "guided":
         guided = GuidedTemplate(
             paper, rows=settings.top_k, experiences=settings.most_experiences("guided"), ranked=True
