@@ -100,11 +100,9 @@ class PhrasedNote:
     @property
     def is_read(self) -> bool:
         """Whether the rest has nothing for the LLM to read."""
-        return (
-            (self.orders or not self.rest.strip(" .,;:!?"))
-            and not numbers_of(self.rest)
-            and not list(self._unread(self._read_orders().values, ()))
-        )
+        if numbers_of(self.rest) or any(self._unread(self._read_orders().values, ())):
+            return False
+        return self.orders or not self.rest.strip(" .,;:!?")
 
     def completed(self, read: Guidance, numbers: Collection[float]) -> tuple[Guidance, list[str]]:
         """The whole note's guidance, and doubts: what is in no order, and ends that no order can have.

@@ -51,9 +51,11 @@ class LocalPilot:
         self._steps: dict[int, int] = {}
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
-        """The policy's choice."""
+        """The policy's choice; raises ``ValueError`` unless it is two whole numbers."""
         self._steps[uav] = int(observation["step"][0])
         sensor, velocity = self._policy.decide(uav, observation, taken)
+        if (int(sensor), int(velocity)) != (sensor, velocity):
+            raise ValueError(f"UAV {uav}, step {self._steps[uav]}: ({sensor}, {velocity}) are not two whole numbers")
         return PilotChoice(int(sensor), int(velocity), "onboard", self._reason)
 
     def learn(self, uav: int, choice: PilotChoice, cost: float, failed: bool) -> None:

@@ -14,6 +14,7 @@ from simulator.flying.flight import fly
 from simulator.flying.pilots import EdgePilot, LocalPilot
 from simulator.records.flight import Flight
 from simulator.sites.site import Site
+from simulator.world.observation import Observation
 from tests.conftest import Edge
 from tests.support.edge_stub import EdgeStub, free_port, stub_edge, stub_edge_at
 from tests.support.waiting import PATIENCE_S
@@ -31,6 +32,17 @@ def stub() -> Iterator[EdgeStub]:
 def client(stub: EdgeStub) -> Iterator[EdgeClient]:
     with EdgeClient(stub.url, timeout_s=PATIENCE_S, attempts=2) as edge:
         yield edge
+
+
+def test_a_policys_choice_must_be_whole_numbers() -> None:
+    class Slow:
+        def reset(self, scenario: Scenario, seed: int) -> None: ...
+
+        def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
+            return 3, 7.5  # type: ignore[return-value]
+
+    with pytest.raises(ValueError, match=r"UAV 0, step 0: \(3, 7\.5\) are not two whole numbers"):
+        fly(Site(SHORT), LocalPilot("slow", SHORT, 0, Slow()), seed=0)
 
 
 def test_every_uav_asks_at_every_step_and_every_outcome_arrives(stub: EdgeStub, client: EdgeClient) -> None:
