@@ -29,7 +29,7 @@ from service.llm.request_bodies import (
 )
 from service.llm.usability import CircuitBreaker, SilenceCounter, Usability
 from shared.wire.reasons import Reason
-from shared.wire.schemas import Readiness
+from shared.wire.schemas import LLM_MODES, Readiness
 
 # How often a request is cancelled for a decision, the quiet time that it waits for, and how long it waits at most. Each
 # request evicts the other kind's prefix from the cache. In a mission, decisions come seconds apart.
@@ -153,7 +153,7 @@ class LlmServer:
         ready, connection = self.status.llm == "ready", self.connection
         return Readiness(
             ready=True,
-            decides=self._settings.mode if ready else "policy",
+            decides=self._settings.mode if ready or self._settings.mode not in LLM_MODES else "policy",
             llm="degraded" if ready and self.usability.degraded else self.status.llm,
             model=connection.model,
             constraint=connection.abilities.constraint if ready else None,

@@ -339,7 +339,7 @@ def test_operation(edge: Edge) -> None:
     client = edge()
     assert client.get("/healthz").json() == {"status": "ok"}
     ready = client.get("/readyz").json()
-    assert (ready["ready"], ready["decides"], ready["llm"]) == (True, "policy", "off")
+    assert (ready["ready"], ready["decides"], ready["llm"]) == (True, "value", "off")
     assert "<title>AIC-VDS mission</title>" in client.get("/").text
     assert client.get("/nowhere").headers["content-type"] == "application/problem+json"
     assert client.get("/decide").status_code == 405
