@@ -58,5 +58,5 @@ def problem_of(error: Mapping[str, Any], known: Collection[str] = ()) -> str:
 
 def suggestion(name: str, known: Collection[str]) -> str:
     """``; did you mean X?`` with the nearest known name; empty where none is near."""
-    near = get_close_matches(name, known, n=1)
+    near = get_close_matches(name, known, n=1, cutoff=0.75)
     return f"; did you mean {near[0]}?" if near else ""
