@@ -208,7 +208,7 @@ def test_an_edge_decides_and_learns_without_torch_and_llama_cpp() -> None:
         "import sys; sys.modules['torch'] = sys.modules['xllamacpp'] = None;"
         "import service.api.app;"
         "from service.learning.initial_weights import initial_weights; from service.learning.learner import Learner;"
-        "from service.learning.modules import WIDTH, Sample; import numpy as np;"
+        "from service.learning.modules import Sample; import numpy as np;"
         "sample = Sample(np.ones((6, 5), np.float32), 2, np.ones(1, np.float32), 7);"
         "[Learner(initial_weights(init, 'paper', 15, 0), learning_rate=1e-3).update(sample, 0.3)"
         " for init in ('pretrained', 'random')]"
