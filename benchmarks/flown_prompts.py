@@ -119,14 +119,12 @@ class Scribe(LocalPilot):
         return choice
 
     def _put(self, mission: Mission, view: AttendedState) -> Put:
-        shown, nearest = view.shown(), view.similar_experiences()
+        shown = view.shown()
         if not isinstance(mission.template, GuidedTemplate):
-            return Put(mission.template.prompt(view.state, shown, mission.experiences.block, nearest), view.kept_ids)
+            return Put(mission.template.prompt(view.state, shown, mission.experiences.block), view.kept_ids)
         offer = candidates_of(view, template_of(mission))
         self._note(mission, mission.template, view, offer)
-        return Put(
-            mission.template.choice_prompt(offer, view.state, mission.experiences.block, nearest), view.kept_ids, offer
-        )
+        return Put(mission.template.choice_prompt(offer, view.state, mission.experiences.block), view.kept_ids, offer)
 
     def _note(self, mission: Mission, template: GuidedTemplate, view: AttendedState, offer: CandidateSet) -> None:
         self._step = {uav: had for uav, had in self._step.items() if had[1].step == view.step}

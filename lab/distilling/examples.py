@@ -121,7 +121,7 @@ def _example(state: AttendedState, reference: Reference) -> PromptExample:
     mission = state.mission
     template = template_of(mission)
     candidates = candidates_of(state, template)
-    prompt = template.choice_prompt(candidates, state.state, mission.experiences.block, state.similar_experiences())
+    prompt = template.choice_prompt(candidates, state.state, mission.experiences.block)
     rollout = RolloutState.of(
         mission.belief, mission.scenario, state.step, state.uav_id, seed=mission.spec.seed, reserved=state.reserved
     )

@@ -56,7 +56,7 @@ def tokens_by_step(scenario: Scenario, seeds: Sequence[int]) -> tuple[FloatArray
 
 def _prompt(state: AttendedState) -> Prompt:
     mission = state.mission
-    return mission.template.prompt(state.state, state.shown(), mission.experiences.block, state.similar_experiences())
+    return mission.template.prompt(state.state, state.shown(), mission.experiences.block)
 
 
 @dataclass(frozen=True, eq=False)

@@ -198,12 +198,6 @@ class AttendedState:
         shuffle = np.random.default_rng([spec.seed, self.step, self.uav_id])
         return [self.rows[i] for i in shuffle.permutation(len(self.rows))]
 
-    def similar_experiences(self) -> list[str]:
-        """Past decisions most similar to the rows kept, for the prompt's last block, in selection ``similar``."""
-        if not self.rows or self.mission.experiences.selection != "similar":
-            return []
-        return self.mission.experiences.nearest(self.features[[self.admissible.index(row) for row in self.rows]])
-
     def best_by_value(self) -> Action:
         """The best-scored sensor and the best velocity for it that is allowed, by the learned values."""
         row = self.rows[0]

@@ -122,9 +122,7 @@ class Deliberation:
         )
         return cls(
             candidates=candidates,
-            prompt=template.choice_prompt(
-                candidates, state.state, mission.experiences.block, state.similar_experiences()
-            ),
+            prompt=template.choice_prompt(candidates, state.state, mission.experiences.block),
             advised={name: found.probabilities(candidates.actions) for name, found in preferences.items()},
             take_rollout=take_rollout,
         )

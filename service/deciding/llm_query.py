@@ -161,11 +161,9 @@ class LlmQueries:
         asked = {state.uav_id: (state, candidates_of(state, template)) for state in states if state.rows}
         if not asked:
             return {}
-        similar = dict.fromkeys(line for state, _ in asked.values() for line in state.similar_experiences())
         prompts = template.fleet_prompts(
             {uav: (candidates, state.state) for uav, (state, candidates) in asked.items()},
             mission.experiences.block,
-            list(similar),
         )
         static, user = template.fleet_static, "".join(prompt.user for prompt in prompts.values())
         labels = [list(candidates.labels) for _, candidates in asked.values()]

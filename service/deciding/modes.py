@@ -86,8 +86,7 @@ class PolicyMode:
     def question(self, state: AttendedState, task: DecisionTask) -> Question:
         """The template's prompt, by which tokens are accounted for in every mode."""
         mission = state.mission
-        similar = state.similar_experiences()
-        return Question(mission.template.prompt(state.state, state.shown(), mission.experiences.block, similar))
+        return Question(mission.template.prompt(state.state, state.shown(), mission.experiences.block))
 
     async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
         """Always the LLM-free policy."""
@@ -146,8 +145,8 @@ class LetterMode(LlmMode):
             return super().question(state, task)
         template = template_of(state.mission)
         candidates = candidates_of(state, template)
-        block, similar = state.mission.experiences.block, state.similar_experiences()
-        return Question(template.choice_prompt(candidates, state.state, block, similar), candidates=candidates)
+        prompt = template.choice_prompt(candidates, state.state, state.mission.experiences.block)
+        return Question(prompt, candidates=candidates)
 
     async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
         """The likeliest candidate."""

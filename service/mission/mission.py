@@ -93,7 +93,7 @@ class Mission:
         self.prompt_fits = not spec.uses_llm or self.prompt_fit.fits()
         if spec.uses_llm and not restored:
             self.prompt_fit.check()
-        self.experiences = Experiences(spec.prompt.experiences, spec.prompt.selection, self.scenario.uavs)
+        self.experiences = Experiences(spec.prompt.experiences, spec.prompt.selection)
         self.decisions = 0
         self.feedback = 0
         self.learner = Learner(weights, learning_rate=settings.learning_rate)
@@ -224,11 +224,10 @@ class Mission:
         self.belief.settle(decision.uav_id, decision.step, outcome.failed)
         action = Action(decision.sensor_id, decision.velocity)
         line = self.template.experience(decision.seen, action, outcome.cost, outcome.failed)
-        features = None if (sample := decision.sample) is None else sample.features[sample.chosen].copy()
-        self.experiences.remember(Experience(line, outcome.cost, features, decision.sensor_id, outcome.failed))
+        self.experiences.remember(Experience(line, decision.sensor_id, outcome.failed))
         for trust in self.trust.values():
             trust.settle(outcome.decision_id, outcome.cost)
-        return sample
+        return decision.sample
 
     def learn(self, sample: Sample, cost: float) -> float | None:
         """Train on one sample; returns the loss before the update, None if the learner fails."""

@@ -7,7 +7,6 @@ from service.errors import Refused
 from service.llm.request_bodies import WarmUp
 from service.mission.resolved_spec import ResolvedSpec
 from service.prompting.compact_prompt import CompactTemplate
-from service.prompting.experiences import NEAREST
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.paper_prompt import Template
 from service.prompting.prompt import note_block
@@ -65,8 +64,7 @@ class PromptFit:
     def _needed(self, uavs: int = 1) -> int:
         """The most tokens that a prompt can have."""
         style = self.spec.prompt
-        lines = style.experiences + (NEAREST if style.selection == "similar" else 0)
-        needed = prompt_tokens(style.format, self._rows * uavs, lines, self.spec.features)
+        needed = prompt_tokens(style.format, self._rows * uavs, style.experiences, self.spec.features)
         # A tokenizer makes at most one token of each byte. The compact prompt has no text of the note.
         return needed + (0 if self._compact else len(note_block(self.spec.note).encode()))
 

@@ -1,7 +1,6 @@
 """The prompt of mode ``guided``: rows of sensors with choice letters, one of which is the LLM's answer."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from service.prompting.candidates import CandidateSet, Letters, Viewpoint
 from service.prompting.paper_prompt import Template
@@ -109,20 +108,12 @@ class GuidedTemplate(Template):
 
         return CandidateSet.of(state, offered, shown, self.letters, write)
 
-    def choice_prompt(
-        self, candidates: CandidateSet, state: State, experiences: Sequence[str], nearest: Sequence[str] = ()
-    ) -> Prompt:
+    def choice_prompt(self, candidates: CandidateSet, state: State, experiences: Sequence[str]) -> Prompt:
         """The prompt for one decision; the parameters are those of :meth:`Template.prompt`."""
-        last = "".join(nearest)
-        return Prompt(
-            static=self.static,
-            experiences="".join(experiences),
-            state=last + candidates.rows,
-            uncompressed=UnprunedState(state, row, last),
-        )
+        return Prompt(self.static, "".join(experiences), candidates.rows, UnprunedState(state, row))
 
     def fleet_prompts(
-        self, uavs: Mapping[int, tuple[CandidateSet, State]], experiences: Sequence[str], nearest: Sequence[str] = ()
+        self, uavs: Mapping[int, tuple[CandidateSet, State]], experiences: Sequence[str]
     ) -> dict[int, Prompt]:
         """One prompt about several UAVs, as each UAV's share of it by UAV.
 
@@ -133,13 +124,7 @@ class GuidedTemplate(Template):
             unpruned = UnprunedState(state, row, _list(uav, ""))
             shares[uav] = Prompt("", "", _list(uav, candidates.numbered_rows()), unpruned)
         uav, first = next(iter(shares.items()))
-        last = "".join(nearest)
-        shares[uav] = Prompt(
-            static=self.fleet_static,
-            experiences="".join(experiences),
-            state=last + first.state,
-            uncompressed=replace(first.uncompressed, head=last + first.uncompressed.head),
-        )
+        shares[uav] = Prompt(self.fleet_static, "".join(experiences), first.state, first.uncompressed)
         return shares
 
     def content_free(self, uavs: Sequence[int] = ()) -> list[str]:

@@ -98,18 +98,15 @@ class Template:
         """The row of a sensor that the report lacks."""
         return {**dict.fromkeys(self._columns, UNKNOWN), "sensor_id": str(sensor_id)}
 
-    def prompt(
-        self, state: State, kept_rows: Sequence[int], experiences: Sequence[str], nearest: Sequence[str] = ()
-    ) -> Prompt:
+    def prompt(self, state: State, kept_rows: Sequence[int], experiences: Sequence[str]) -> Prompt:
         """The prompt for one decision.
 
         Args:
             kept_rows: the rows of the state to show, in this order.
             experiences: the lines of the block of experiences.
-            nearest: lines of experiences for this prompt only.
         """
         east, north = state.position
-        last = f"{''.join(nearest)}UAV at {east:.0f},{north:.0f}\n"
+        last = f"UAV at {east:.0f},{north:.0f}\n"
         return Prompt(
             static=self.static,
             experiences="".join(experiences),

@@ -15,8 +15,8 @@ class Prompt:
     """One prompt.
 
     Attributes:
-        state: the last block. It includes experiences retrieved for this decision only, which are not cached.
-        uncompressed: the last block without pruning by attention and without masks, with the same experiences.
+        state: the last block.
+        uncompressed: the last block without pruning by attention and without masks.
         kept: the sensors' rows of ``state`` if it is ``uncompressed`` but for the other rows; None if it differs.
     """
 

@@ -7,7 +7,7 @@ surveyed position (``x``, ``y``), and ``null`` in the four columns that only a b
 import operator
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from shared.wire.names import MapShapes, Names
 from shared.wire.problem import INCOMPLETE
@@ -40,7 +40,11 @@ LLM_MODES: tuple[Mode, ...] = ("llm", "guided")
 Init = Literal["pretrained", "random"]
 Features = Literal["paper", "reach"]
 Belief = Literal["fleet", "reported"]
-Selection = Literal["recent", "similar", "best", "failures"]
+# Version 0.1.0 had two more, which ``failures`` replaces.
+Selection = Annotated[
+    Literal["recent", "failures"],
+    BeforeValidator(lambda value: "failures" if value in ("similar", "best") else value),
+]
 Source = Literal["llm", "guided", "value", "policy"]
 Uplink = Literal["full", "delta", "pruned"]
 
@@ -289,9 +293,8 @@ class PromptStyle(Received):
     )
     selection: Selection | None = Field(
         None,
-        description="experiences that stay: the newest, those most like the present state, the best and some of the "
-        "worst, or the newest of each sensor with failures first; default: the service's, and `failures` with the "
-        "compact prompt",
+        description="experiences that stay: the newest, or the newest of each sensor with failures first; default: "
+        "the service's, and `failures` with the compact prompt",
     )
     # Specs of stored missions name it.
     demonstrations: int = Field(0, ge=0, le=0, deprecated=True, description="0: no prompt has worked examples any more")

@@ -77,7 +77,7 @@ class Replay:
     """The rows' order."""
     experiences: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Experiences in the prompt, 0 to 100."""
-    selection: Annotated[Selection | None, arg(metavar="recent|similar|best|failures", help_behavior_hint="")] = None
+    selection: Annotated[Selection | None, arg(metavar="recent|failures", help_behavior_hint="")] = None
     """The selection of experiences beyond that number."""
     deadline_ms: Annotated[int | None, arg(metavar="MS", help_behavior_hint="")] = None
     """Milliseconds that the edge may take for one decision, 10 to 60000. Default: as in each request."""

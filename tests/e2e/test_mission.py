@@ -17,7 +17,7 @@ def test_a_mission_flown_by_the_llm_and_asked_again(tmp_path: Path) -> None:
         flown = run(
             "simulate", "--edge", url, "--steps", "4", "--seed", "2", "--no-bound", "--out", str(tmp_path / "out")
         )
-        options = ("--top-k", "3", "--experiences", "4", "--selection", "similar", "--out", str(tmp_path / "again"))
+        options = ("--top-k", "3", "--experiences", "4", "--selection", "failures", "--out", str(tmp_path / "again"))
         again = run("replay", str(tmp_path / "out"), "--edge", url, *options)
     assert flown.returncode == 0, flown.stderr
     assert again.returncode == 0, again.stderr

@@ -35,7 +35,7 @@ def test_what_is_on_disk_is_the_mission_with_and_without_checkpoints(
     monkeypatch.setattr("service.storage.journal.Journal.due.__defaults__", (events,))
     settings = Settings(mode=mode, llm_gguf=Path("none"))
     with running(tmp_path / "m.db", mode=mode, llm_gguf="none", planner_ms=20) as (client, engine):
-        spec = {"seed": 3, "note": "visit sensor 2 every fourth step", "mode": mode, "prompt": {"selection": "similar"}}
+        spec = {"seed": 3, "note": "visit sensor 2 every fourth step", "mode": mode, "prompt": {"selection": "best"}}
         client.put("/missions/test", json=spec)
         answer = {"guidance": {"sensors": [{"sensor_id": 2, "visit_every": 4}]}}
         assert client.post("/missions/test/guidance", json=answer).status_code == 200

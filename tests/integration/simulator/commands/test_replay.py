@@ -105,7 +105,7 @@ def test_another_mode_prompt_and_k_are_compared_and_different_decisions_are_not_
     client = edge(mode="llm", llm_gguf="none")
     url = str(client.base_url)
     run = fly(url, tmp_path / "run", 8)
-    changes = "--mode value --top-k 2 --features reach --init random --experiences 4 --selection best"
+    changes = "--mode value --top-k 2 --features reach --init random --experiences 4 --selection failures"
     again = replay_again(run, url, tmp_path / "again", *changes.split())
     assert again.changed == {
         "mode": ("llm", "value"),
@@ -113,7 +113,7 @@ def test_another_mode_prompt_and_k_are_compared_and_different_decisions_are_not_
         "features": (None, "reach"),
         "init": ("pretrained", "random"),
         "prompt.experiences": (30, 4),
-        "prompt.selection": ("recent", "best"),
+        "prompt.selection": ("recent", "failures"),
     }
     assert next(iter(again.by_source)) == "value"
     assert again.replayed.prompt_tokens != again.logged.prompt_tokens

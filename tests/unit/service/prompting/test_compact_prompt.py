@@ -83,7 +83,7 @@ def test_experiences_come_first_and_a_mission_has_none_unless_it_asks() -> None:
     for count, before in ((0, ""), (2, "7d9X9a0Y")):
         mission, state = flown(PAPER, 2, prompt={"experiences": count, "format": "compact"}, mode="guided")
         for line in ("7d9X", "9a0Y"):
-            mission.experiences.remember(Experience(line, 1.0, None, 3, failed=True))
+            mission.experiences.remember(Experience(line, 3, failed=True))
         template = template_of(mission)
         candidates = candidates_of(state, template)
         prompt = template.choice_prompt(candidates, state.state, mission.experiences.block)
