@@ -91,12 +91,11 @@ def test_the_uncompressed_state_is_counted_as_if_it_were_written(features: Featu
     drawn = random.Random(features)
     queue = [None if drawn.random() < 0.3 else float(int(10 ** drawn.uniform(0, 5)) - 1) for _ in range(300)]
     view = attended(m, uav(step=3000, x=[10 ** drawn.uniform(0, 6) for _ in queue], queue=queue), 3000)
-    for lines in ([], ["20,50,-90,100,0,17,0 > 1 7: 0.1\n"]):
-        prompt = m.template.prompt(view.state, view.shown(), [], lines)
-        tokens, whole = COUNTER.account(prompt), prompt.uncompressed
-        assert len(whole.text.splitlines()) >= 300
-        assert tokens.state_uncompressed == COUNTER.count(whole.text)
-        assert (prompt.kept, tokens.state) == (view.shown(), COUNTER.count(prompt.state))
-        assert COUNTER.account(replace(prompt, kept=None)) == tokens
+    prompt = m.template.prompt(view.state, view.shown(), [])
+    tokens, whole = COUNTER.account(prompt), prompt.uncompressed
+    assert len(whole.text.splitlines()) >= 300
+    assert tokens.state_uncompressed == COUNTER.count(whole.text)
+    assert (prompt.kept, tokens.state) == (view.shown(), COUNTER.count(prompt.state))
+    assert COUNTER.account(replace(prompt, kept=None)) == tokens
     rows = UnprunedState(view.state, row)
     assert rows.tokens_by_row(COUNTER.count).tolist() == [COUNTER.count(f"{line}\n") for line in rows.text.splitlines()]
