@@ -22,7 +22,7 @@ _MOST_ORDERS = 8
 METRES_A_SECOND = {None: 1.0, "m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "kn": 0.514444}
 SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 # A converted velocity this near to a whole number is that number.
-_ROUNDING = 0.05
+ROUNDING = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +203,7 @@ class _Orders:
         if number is None or number.unit not in METRES_A_SECOND:
             raise BadOrders("a velocity has no number in m/s, km/h, mph or knots")
         value = number.value * METRES_A_SECOND[number.unit]
-        level = round(value) if abs(value - round(value)) <= _ROUNDING else rounded(value)
+        level = round(value) if abs(value - round(value)) <= ROUNDING else rounded(value)
         if level > self._scenario.max_velocity:
             raise BadOrders(f"{level} m/s is above the fleet's top speed, {self._scenario.max_velocity} m/s")
         return level
