@@ -159,20 +159,8 @@ class AttendedState:
             for sensor, score in zip(state.ids[rows].tolist(), attended.scores[kept].tolist(), strict=True)
         ]
         watch.ended.append(("attend", perf_counter()))
-        return cls(
-            mission=mission,
-            uav_id=uav.uav_id,
-            step=step,
-            state=state,
-            reserved=reserved,
-            guidance=guidance,
-            prompt_view=view,
-            admissible=admissible,
-            features=features,
-            contexts=attended.contexts,
-            rows=rows,
-            candidates=candidates,
-        )
+        found = (view, admissible, features, attended.contexts, rows, candidates)
+        return cls(mission, uav.uav_id, step, state, reserved, guidance, *found)
 
     @cached_property
     def reach(self) -> Reach:

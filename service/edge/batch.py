@@ -54,18 +54,8 @@ class BatchDecider:
             # The evaluator may exceed its UAV's share, as long as enough time is left for the later UAVs.
             evaluation = max(mine, Deadline(deadline.at - RESERVE_S - self._pipeline.own_s * later))
             deadline_ms = max(1, int((evaluation.at + RESERVE_S - own.started) * 1e3))
-            task = DecisionTask(
-                mission,
-                uav,
-                step,
-                attempts[uav.uav_id],
-                deadline_ms,
-                mine,
-                evaluation,
-                own,
-                plan,
-                advice.get(uav.uav_id),
-            )
+            attempt, advised = attempts[uav.uav_id], advice.get(uav.uav_id)
+            task = DecisionTask(mission, uav, step, attempt, deadline_ms, mine, evaluation, own, plan, advised)
             decided = await self._pipeline.decide_one(task)
             if mission.planner is None or mission.planner.action(uav.uav_id) != decided.choice.action:
                 plan = None

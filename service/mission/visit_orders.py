@@ -102,16 +102,10 @@ class VisitOrders:
         counts = []
         for order in self._orders():
             met, missed = order.count(through)
-            counts.append(
-                VisitDeadline(
-                    sensor_id=order.sensor_id,
-                    visit_every=order.every,
-                    since=order.since,
-                    until=order.until,
-                    met=met,
-                    missed=missed,
-                )
-            )
+            sensor, every, since, until = order.sensor_id, order.every, order.since, order.until
+            counts += [
+                VisitDeadline(sensor_id=sensor, visit_every=every, since=since, until=until, met=met, missed=missed)
+            ]
         return counts
 
     def _orders(self) -> Iterator[_Order]:

@@ -92,15 +92,8 @@ class Whereabouts:
     def of(cls, state: Sequence[Any]) -> Self:
         """From such a state; one of an earlier version ends with the action."""
         step, (x, y), progress_m, action, failed, visit, taught = (*state, None, None, -1)[:7]
-        return cls(
-            step=step,
-            position=(x, y),
-            progress_m=progress_m,
-            action=None if action is None else (action[0], action[1]),
-            failed=failed,
-            visit=None if visit is None else Visit(*visit),
-            taught=taught,
-        )
+        seen = None if visit is None else Visit(*visit)
+        return cls(step, (x, y), progress_m, None if action is None else (action[0], action[1]), failed, seen, taught)
 
 
 class FleetBelief:

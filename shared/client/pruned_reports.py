@@ -105,16 +105,9 @@ class UavKnowledge:
         With fewer than k admissible sensors, the nearest others follow, since the edge needs some sensors.
         """
         assert self.published is not None and self._attention is not None
-        state = augment(
-            uav,
-            step,
-            self.scenario,
-            visits=self._records.visits,
-            rates=self._records.rates,
-            reserved=(),
-            preset=self.published.features,
-            belief=self._belief if self.published.belief == "fleet" else None,
-        )
+        visits, rates, preset = self._records.visits, self._records.rates, self.published.features
+        belief = self._belief if self.published.belief == "fleet" else None
+        state = augment(uav, step, self.scenario, visits=visits, rates=rates, reserved=(), preset=preset, belief=belief)
         return _best_rows(state, self._attention.scores(state.features(self.scenario)), self.published.top_k)
 
 

@@ -131,18 +131,11 @@ class CurrentPlan(NamedTuple):
     def empty(cls, tables: Tables) -> Self:
         """Empty arrays for a problem's plans."""
         (steps, sensors, width), uavs = tables.lost.shape, len(tables.fixed)
-        return cls(
-            sensor=_numbers(steps, uavs),
-            velocity=_numbers(steps, uavs),
-            place=_numbers(steps, uavs),
-            odds=_floats(sensors, steps + 1, 3 * width),
-            paid=_floats(sensors, steps + 1),
-            behind=_floats(sensors, steps, 2 * width),
-            known=_numbers(sensors),
-            unknown=_numbers(sensors),
-            stage=_numbers(sensors),
-            cost=_floats(sensors),
-        )
+        sensor, velocity, place = (_numbers(steps, uavs) for _ in range(3))
+        odds, paid = _floats(sensors, steps + 1, 3 * width), _floats(sensors, steps + 1)
+        known, unknown, stage = (_numbers(sensors) for _ in range(3))
+        behind, cost = _floats(sensors, steps, 2 * width), _floats(sensors)
+        return cls(sensor, velocity, place, odds, paid, behind, known, unknown, stage, cost)
 
 
 class Proposal(NamedTuple):
@@ -173,18 +166,10 @@ class Proposal(NamedTuple):
     def empty(cls, tables: Tables) -> Self:
         """Empty arrays for changes of a problem's plans."""
         (steps, sensors, width), uavs = tables.lost.shape, len(tables.fixed)
-        return cls(
-            sensor=_numbers(steps, uavs),
-            velocity=_numbers(steps, uavs),
-            place=_numbers(steps, uavs),
-            stage=_numbers(sensors),
-            cost=_floats(sensors),
-            first=_numbers(sensors),
-            last=_numbers(sensors),
-            odds=_floats(2, 3 * width),
-            value=_floats(2 * width),
-            terms=_floats(width),
-        )
+        sensor, velocity, place = (_numbers(steps, uavs) for _ in range(3))
+        stage, first, last = (_numbers(sensors) for _ in range(3))
+        odds, value, terms = _floats(2, 3 * width), _floats(2 * width), _floats(width)
+        return cls(sensor, velocity, place, stage, _floats(sensors), first, last, odds, value, terms)
 
 
 def _links(problem: FleetProblem, most: int) -> tuple[IntArray, Floats]:

@@ -64,15 +64,10 @@ def site_of(
     scenario = overrides.scenario(derived)
     names, gains = list(survey.sensors), folder / GAINS
     lengths_m = [path.length_m for path in trajectories(scenario)]
-    site = Site(
-        scenario,
-        _arrivals(folder / ARRIVALS, scenario, names),
-        read_gains(gains, names, lengths_m) if gains.exists() else None,
-        frame,
-        tuple(names),
-        fences,
-        *names_and_map(survey, folder / FEATURES, frame, fences),
-    )
+    arrivals = _arrivals(folder / ARRIVALS, scenario, names)
+    links = read_gains(gains, names, lengths_m) if gains.exists() else None
+    mapped = names_and_map(survey, folder / FEATURES, frame, fences)
+    site = Site(scenario, arrivals, links, frame, tuple(names), fences, *mapped)
     far = [name for name, near in zip(survey.sensors, _reachable(scenario), strict=True) if not near]
     if far:
         named = ", ".join(quoted(name) for name in far[:FAR_NAMED]) + (" and others" if len(far) > FAR_NAMED else "")
