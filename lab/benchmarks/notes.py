@@ -96,7 +96,7 @@ def control(note: str) -> Guidance | None:
     names = dict(zip(map(str, theirs), map(str, ours), strict=True))
     try:
         return parse_orders(re.sub(r"[0-9]+", lambda found: names.get(found[0], found[0]), orders), note)
-    except BadOrders:
+    except (BadOrders, Impossible):
         return None
 
 

@@ -5,9 +5,10 @@ is constrained to the orders that the note's numbers allow. The answer is parsed
 does not match the note, or that the fleet cannot follow, is refused, and the LLM is asked again a few times. Without an
 LLM no note is compiled.
 
-An embedded LLM with the orders' adapter reads the note three times, each time with other letters for its numbers, so
-that an answer caused by a letter does not recur. The most frequent reading is the note's. It has doubts if another one
-differs or a token of an answer was unlikely.
+An embedded LLM with the orders' adapter reads the note. If it reads the same as the rules of
+:mod:`service.guidance.plain_reading`, the reading is certain. Else it reads the note twice more, each time with other
+letters for its numbers, so that an answer caused by a letter does not recur. The most frequent reading is the note's,
+and has a doubt.
 
 Compiling runs concurrently with decisions, and no decision waits for it. The embedded model answers one request at a
 time and serves decisions first.
@@ -15,19 +16,20 @@ time and serves decisions first.
 
 import asyncio
 import logging
-import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Protocol
 
 from service.guidance.lettered_orders import PARTLY, STATIC, NoteReading, grammar, meaning
-from service.guidance.note_numbers import LetteredNote
+from service.guidance.note_numbers import LetteredNote, numbers_of
 from service.guidance.note_orders import INSTRUCTION, BadOrders, constrain_orders, parse_orders, similar_examples
 from service.guidance.note_phrases import PhrasedNote
 from service.guidance.operator_guidance import OperatorGuidance
-from service.llm.answers import Completion, NoDecision
-from service.llm.request_bodies import Constraint, Rewriting
+from service.guidance.plain_reading import plain_reading
+from service.llm.answers import NoDecision
+from service.llm.request_bodies import Rewriting
 from service.llm.server_pool import ServerPool
 from shared.planning.orders import NO_GUIDANCE, Guidance, Impossible
 from shared.world.scenario import Scenario
@@ -44,14 +46,9 @@ _POLL_S = 0.2
 _NOT_JUDGED = "How well this LLM reads notes is not known: compare each order with the note."
 
 _READINGS = 3
-# An answer is certain if the joint probability of its tokens is at least this. Of 160 made-up notes of held-out
-# phrasings the adapter that ships read 20 with this certainty, all correctly; at 0.98 it read 25, 2 of them wrongly, at
-# 0.8 64 and 8.
-_SURE = 0.99
 _MOST_TOKENS = 96
-_LIKELIEST = 5
 _DIFFER = "“{note}” can be read in more than one way."
-_UNLIKELY = "The LLM is not sure of its reading of “{note}”."
+_ALONE = "No rule confirms the LLM's reading of “{note}”: compare the orders with it."
 
 
 async def read_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReading:
@@ -62,22 +59,29 @@ async def read_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReadi
         Impossible: most answers order something that the fleet cannot do.
         NoDecision: the LLM gave no answer.
     """
-    found: list[tuple[NoteReading | BadOrders | Impossible, float]] = []
+    plain = plain_reading(note, scenario)
+    found: list[NoteReading | BadOrders | Impossible] = []
     for seed in range(_READINGS):
         try:
             lettered = LetteredNote.of(note, seed)
         except ValueError as error:
             raise BadOrders(str(error)) from None
         answer = await llm.rewrite(_request(lettered), temperature=0.0, seed=seed)
-        found.append((_checked(answer.text, lettered, scenario), _probability(answer)))
+        reading = _checked(answer.text, lettered, scenario)
+        if isinstance(reading, NoteReading) and not reading.guidance.ends and reading.guidance.values == plain:
+            return reading
+        found.append(reading)
+    if plain is not None:
+        with suppress(Impossible):
+            guidance = Guidance.of(plain, {})
+            guidance.check(scenario)
+            used = frozenset(number.value for number in numbers_of(note.lower()))
+            return NoteReading(guidance, (_DIFFER.format(note=note),), used)
     return _most(found, note)
 
 
 def _request(note: LetteredNote) -> Rewriting:
-    def constrain(_: Constraint) -> dict[str, object]:
-        return {"grammar": grammar(note), "max_tokens": _MOST_TOKENS, "logprobs": True, "top_logprobs": _LIKELIEST}
-
-    return Rewriting(STATIC, [], note.text, constrain)
+    return Rewriting(STATIC, [], note.text, lambda _: {"grammar": grammar(note), "max_tokens": _MOST_TOKENS})
 
 
 def _checked(answer: str, note: LetteredNote, scenario: Scenario) -> NoteReading | BadOrders | Impossible:
@@ -89,26 +93,14 @@ def _checked(answer: str, note: LetteredNote, scenario: Scenario) -> NoteReading
     return reading
 
 
-def _probability(answer: Completion) -> float:
-    """The joint probability of the answer's tokens; 0 if the server gives none."""
-    if not answer.positions:
-        return 0.0
-    return math.prod(position.likeliest.get(position.token.strip(), 0.0) for position in answer.positions)
-
-
-def _most(found: Sequence[tuple[NoteReading | BadOrders | Impossible, float]], note: str) -> NoteReading:
-    """The most frequent reading, the likelier of equal ones; raises the most frequent error."""
-    texts = [str(one) if isinstance(one, Exception) else one.guidance.model_dump_json() for one, _ in found]
-    often = Counter(texts)
-    reading = found[max(range(len(found)), key=lambda i: (often[texts[i]], found[i][1]))][0]
+def _most(found: Sequence[NoteReading | BadOrders | Impossible], note: str) -> NoteReading:
+    """The most frequent reading, the first of equal ones, with a doubt; raises the most frequent error."""
+    texts = [str(one) if isinstance(one, Exception) else one.guidance.model_dump_json() for one in found]
+    reading = found[texts.index(Counter(texts).most_common(1)[0][0])]
     if isinstance(reading, Exception):
         raise reading
-    doubts = list(reading.doubts)
-    if len(often) > 1:
-        doubts.append(_DIFFER.format(note=note))
-    elif min(probability for _, probability in found) < _SURE:
-        doubts.append(_UNLIKELY.format(note=note))
-    return NoteReading(reading.guidance, tuple(doubts), reading.numbers)
+    doubt = [_DIFFER.format(note=note)] if len(set(texts)) > 1 else [_ALONE.format(note=note)] * bool(reading.guidance)
+    return NoteReading(reading.guidance, (*reading.doubts, *doubt), reading.numbers)
 
 
 class NoteOwner(Protocol):

@@ -34,17 +34,9 @@ _EXAMPLES_SHOWN = 8
 
 VISIT, WEIGHT = "visit sensor # every # steps", "sensor # counts # times"
 FASTEST, SLOWEST, FORBIDDEN = "fly at most # m/s", "fly at least # m/s", "do not fly at # m/s"
-_NAMES = {
-    VISIT: "visit:{}",
-    WEIGHT: "weight:{}",
-    FASTEST: "max_velocity",
-    SLOWEST: "min_velocity",
-    FORBIDDEN: "avoid:{}",
-}
-_PATTERNS = {
-    words: re.compile(re.escape(words).replace(r"\#", "([0-9]{1,4})"))
-    for words in (VISIT, WEIGHT, FASTEST, SLOWEST, FORBIDDEN)
-}
+_FORMS = ("visit:{}", "weight:{}", "max_velocity", "min_velocity", "avoid:{}")
+_NAMES = dict(zip((VISIT, WEIGHT, FASTEST, SLOWEST, FORBIDDEN), _FORMS, strict=True))
+_PATTERNS = {words: re.compile(re.escape(words).replace(r"\#", "([0-9]{1,4})")) for words in _NAMES}
 
 _NUMBER_WORDS = {word: value for words in (CARDINALS[:15], ORDINALS[:13]) for value, word in enumerate(words)}
 # "Every other step" is every second step. An ignored sensor, or one that is left out, counts 0 times.
@@ -118,18 +110,10 @@ def constrain_orders(constraint: Constraint, note: str) -> dict[str, Any]:
         one = f"({'|'.join(map(re.escape, orders))})"
         return {"structured_outputs": {"regex": f"({NOTHING}|{one}({SEPARATOR}{one}){{0,{MOST_ORDERS - 1}}})"}}
     if constraint == "json_schema":
-        schema = {
-            "type": "object",
-            "properties": {"orders": {"type": "array", "items": {"type": "string", "enum": list(orders)}}},
-            "required": ["orders"],
-            "additionalProperties": False,
-        }
-        return {
-            "response_format": {
-                "type": "json_schema",
-                "json_schema": {"name": "orders", "strict": True, "schema": schema},
-            }
-        }
+        listed = {"orders": {"type": "array", "items": {"type": "string", "enum": orders}}}
+        schema = {"type": "object", "properties": listed, "required": ["orders"], "additionalProperties": False}
+        named = {"name": "orders", "strict": True, "schema": schema}
+        return {"response_format": {"type": "json_schema", "json_schema": named}}
     return {}
 
 

@@ -51,6 +51,8 @@ class PhrasedNote:
     """
 
     def __init__(self, note: str, scenario: Scenario, in_force: Collection[str]) -> None:
+        for other, words in _TABLE["normal"].items():
+            note = re.sub(other, words, note, flags=re.IGNORECASE)
         self._note = note
         self.rest = self._lowered = note.lower()
         self._scenario, self._in_force = scenario, in_force
@@ -72,8 +74,7 @@ class PhrasedNote:
             self._ends += [(match, kind, self._end(kind, match)) for match in self._taken(patterns)]
         for match in self._taken(_PHRASES["times"]):
             self._doubts.append(f"In no order: “{match[0].strip()}”.")
-        for _ in self._taken(_PHRASES["added"]):
-            pass
+        list(self._taken(_PHRASES["added"]))
         for row, patterns in _ROWS["order"]:
             plain = self._taken(patterns, lambda match: not self._says("conditional", match))
             self._orders += [(row["means"], match) for match in plain]
@@ -145,13 +146,17 @@ class PhrasedNote:
         numbers = numbers_of(text)
         measures = [n for n in numbers if n.unit or not re.search(_TABLE["whose"]["words"], text[: n.begin])]
         step_s = self._scenario.step_s
-        periods = {1, *(int(n.value * SECONDS.get(n.unit or "", step_s) / step_s) for n in measures)}
+        periods = {1, *(_steps(n, step_s) for n in measures)}
         whole = any(_has("whole", clause) and not _has("place", clause) for clause in clauses)
         for name, value in values.items():
             kind, _, sensor = name.partition(":")
-            near = [c for c in clauses if _uses(name, value, numbers_of(c))]
-            near = near or [c for c in clauses if re.search(_TABLE["asks"][kind], c)]
             ignored = kind == "weight" and not value
+            near = [c for c in clauses if _uses(name, value, numbers_of(c))]
+            if ignored:
+                near += [c for c in clauses if _has("ignores", c) and _has("there", c)]
+            if kind == "visit":
+                near += [c for c in clauses if any(n.unit and _steps(n, step_s) == value for n in numbers_of(c))]
+            near = near or [c for c in clauses if re.search(_TABLE["asks"][kind], c)]
             against = _TABLE["against"]["ignore" if ignored else kind]
             both = f"visit:{sensor}" in values and values.get(f"weight:{sensor}") == 0
             measured = value in periods if kind == "visit" else "_" not in kind or _uses(name, value, measures)
@@ -160,7 +165,7 @@ class PhrasedNote:
                 own = f"visit:{value:g}" in values or value == int(sensor)
                 measured = [n.value for n in numbers].count(value) > max(spoken, own)
             denied = near and all(any(_has(k, c) for k in against) for c in near)
-            denied = denied or (ignored and any(_has("said", c) for c in clauses))
+            denied = denied or (ignored and any(_has("said", c) or (not near and _has("single", c)) for c in clauses))
             if both or denied or not measured or (kind == "avoid" and not near):
                 refused[name] = next(iter(near), " ".join(self.rest.split()))
             elif ignored and near and (all(_has("lifts", c) for c in near) or not _has("ignores", self._lowered)):
@@ -251,7 +256,8 @@ class PhrasedNote:
     def _unread(self, values: Mapping[str, float], used: Collection[float]) -> Iterator[str]:
         for clause in _CLAUSE.finditer(self.rest):
             numbers = [n for n in numbers_of(clause[0]) if clause[0][n.begin : n.end] not in ("one", "first", "second")]
-            asked = [kind for kind, words in _TABLE["asks"].items() if re.search(words, clause[0])]
+            met = ("avoid",) if "min_velocity" in values else ()
+            asked = [kind for kind, words in _TABLE["asks"].items() if kind not in met and re.search(words, clause[0])]
             lost = numbers and not all(number.value in used for number in numbers)
             part = asked or _has("whole", clause[0]) or any(n.unit and n.unit in METRES_A_SECOND for n in numbers)
             ignored = "none" in asked or (
@@ -271,6 +277,10 @@ def _uses(name: str, value: float, numbers: list[Number]) -> bool:
         return any(one.unit is None and one.value == int(number) for one in numbers)
     speeds = [one.value * METRES_A_SECOND[one.unit] for one in numbers if one.unit in METRES_A_SECOND]
     return any(abs(speed - value) < 1 for speed in speeds)
+
+
+def _steps(number: Number, step_s: float) -> int:
+    return int(number.value * SECONDS.get(number.unit or "", step_s) / step_s)
 
 
 def _names(row: Mapping[str, Any], match: re.Match[str]) -> list[str]:

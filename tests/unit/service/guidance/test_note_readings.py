@@ -1,4 +1,4 @@
-"""Reading notes with the orders' adapter: three readings, their agreement, and their doubts."""
+"""Reading notes with the orders' adapter and by rules: their agreement, and doubts where there is none."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from service.guidance.lettered_orders import STATIC
 from service.guidance.note_compiler import compile_note
 from service.guidance.note_orders import BadOrders
 from service.guidance.note_phrases import PhrasedNote
-from service.llm.answers import Completion, TokenPosition
+from service.llm.answers import Completion
 from service.llm.request_bodies import Rewriting
 from service.llm.server_pool import ServerPool
 from shared.planning.orders import Guidance, Impossible, SensorWish
@@ -29,43 +29,54 @@ class Adapted:
 
     reads_letters = True
 
-    def __init__(self, answers: Sequence[str], probability: float = 1.0) -> None:
+    def __init__(self, answers: Sequence[str]) -> None:
         self._answers = iter(answers)
-        self._probability = probability
         self.read: list[str] = []
 
     async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> Completion:
         fields = wanted.constrain("grammar")
-        assert (wanted.instruction, temperature, fields["logprobs"]) == (STATIC, 0.0, True)
+        assert (wanted.instruction, temperature) == (STATIC, 0.0)
         letters = re.findall(r"\b[A-Z]\b", wanted.text)
         assert all(f'"{letter}"' in fields["grammar"] for letter in letters)
         self.read.append(wanted.text)
-        text = next(self._answers).format(*letters)
-        positions = tuple(TokenPosition(f" {word}", {word: self._probability}) for word in text.split())
-        return Completion(text, None, None, None, positions)
+        return Completion(next(self._answers).format(*letters), None, None, None)
 
 
-async def reading(llm: Adapted) -> Any:
-    return await compile_note(PhrasedNote(NOTE, PAPER, ()), PAPER, cast(ServerPool, llm))
+async def reading(llm: Adapted, note: str = NOTE) -> Any:
+    return await compile_note(PhrasedNote(note, PAPER, ()), PAPER, cast(ServerPool, llm))
 
 
-async def test_three_readings_with_other_letters_that_agree_have_no_doubt() -> None:
-    llm = Adapted([RIGHT] * 3)
+@pytest.mark.parametrize("answers", [[RIGHT], [OTHER, RIGHT], ["unclear", OTHER, RIGHT]])
+async def test_a_reading_that_the_rules_confirm_has_no_doubt_and_ends_the_search(answers: list[str]) -> None:
+    llm = Adapted(answers)
     found = await reading(llm)
     assert (found.guidance, found.doubts) == (MEANT, ())
-    assert len(set(llm.read)) == 3
+    assert len(set(llm.read)) == len(answers)
+
+
+UNRULY = "Whatever you do, sensor 4 gets its 3 steps, and 9 m/s it is."
 
 
 @pytest.mark.parametrize("answers", [[RIGHT, OTHER, RIGHT], [OTHER, RIGHT, RIGHT], [RIGHT, RIGHT, "unclear"]])
 async def test_where_the_readings_differ_the_commonest_is_proposed_with_a_doubt(answers: list[str]) -> None:
-    found = await reading(Adapted(answers))
+    llm = Adapted(answers)
+    found = await reading(llm, UNRULY)
+    assert found.guidance == MEANT
+    assert found.doubts == (f"“{UNRULY}” can be read in more than one way.",)
+    assert len(set(llm.read)) == 3
+
+
+async def test_a_reading_that_no_rule_confirms_has_a_doubt() -> None:
+    found = await reading(Adapted([RIGHT] * 3), UNRULY)
+    assert found.guidance == MEANT
+    assert found.doubts == (f"No rule confirms the LLM's reading of “{UNRULY}”: compare the orders with it.",)
+
+
+@pytest.mark.parametrize("answer", [OTHER, "unclear"])
+async def test_where_the_llm_never_reads_as_the_rules_do_theirs_is_proposed_with_a_doubt(answer: str) -> None:
+    found = await reading(Adapted([answer] * 3))
     assert found.guidance == MEANT
     assert found.doubts == (f"“{NOTE}” can be read in more than one way.",)
-
-
-async def test_an_unlikely_reading_has_a_doubt() -> None:
-    found = await reading(Adapted([RIGHT] * 3, probability=0.9))
-    assert found.doubts == (f"The LLM is not sure of its reading of “{NOTE}”.",)
 
 
 async def test_a_part_that_the_llm_finds_unclear_is_quoted() -> None:
@@ -88,7 +99,7 @@ async def test_what_code_has_read_is_proposed_beside_what_is_unclear() -> None:
 
 async def test_a_note_that_most_readings_find_unclear_is_refused() -> None:
     with pytest.raises(BadOrders, match="is unclear"):
-        await reading(Adapted(["unclear", RIGHT, "unclear"]))
+        await reading(Adapted(["unclear", RIGHT, "unclear"]), UNRULY)
 
 
 async def test_what_the_fleet_cannot_do_is_refused() -> None:

@@ -104,7 +104,7 @@ def test_one_reading_ignores_no_sensor_without_a_word_that_does() -> None:
 def test_a_weight_of_one_is_no_order_and_its_words_are_quoted() -> None:
     read = Guidance.of({"weight:5": 1}, {})
     guidance, doubts = phrased("Pls get snsr 5 1x asap, need its batt. level").completed(read, {5.0, 1.0})
-    assert (guidance, doubts) == (NO_GUIDANCE, ["In no order: “pls get snsr 5 1x asap”."])
+    assert (guidance, doubts) == (NO_GUIDANCE, ["In no order: “pls get sensor 5 1x asap”."])
 
 
 def test_a_sensors_own_number_is_no_weight() -> None:

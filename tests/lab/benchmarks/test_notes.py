@@ -1,0 +1,34 @@
+"""The held-out notes: the rules misread none of them."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from lab.benchmarks.notes import NOTES, same
+from service.guidance.note_orders import BadOrders
+from service.guidance.note_phrases import PhrasedNote
+from service.guidance.plain_reading import plain_reading
+from shared.planning.orders import Guidance
+from shared.world.scenario import SCENARIOS
+
+PAPER = SCENARIOS["paper"]
+
+
+@pytest.mark.parametrize("name", ["notes.json", "held_out_notes.json", "notes_of_others.json"])
+def test_the_rules_misread_no_note_and_read_most(name: str) -> None:
+    read, rows = 0, json.loads(NOTES.with_name(name).read_text(encoding="utf-8"))
+    for row in rows:
+        note = PhrasedNote(row["note"], PAPER, ())
+        values = {} if note.is_read else plain_reading(note.text, PAPER)
+        if values is None:
+            continue
+        read += 1
+        try:
+            guidance, _ = note.completed(Guidance.of(values, {}), values.values())
+        except BadOrders:
+            # Code refuses what the rules have read.
+            continue
+        assert same(guidance, None if row["guidance"] is None else Guidance.model_validate(row["guidance"])), row
+    assert read > 0.7 * len(rows)

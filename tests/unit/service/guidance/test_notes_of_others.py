@@ -1,0 +1,67 @@
+"""Notes that others wrote and that were once read wrongly, or refused: slips, reasons, conditions, spellings."""
+
+from __future__ import annotations
+
+import pytest
+
+from service.guidance.note_orders import BadOrders
+from shared.planning.orders import NO_GUIDANCE, Guidance
+from tests.unit.service.guidance.test_note_phrases import phrased
+
+
+@pytest.mark.parametrize(
+    ("note", "read"),
+    [
+        ("pls chekc on snesor 0 evry other step", "pls check on sensor 0 every other step"),
+        ("wieght of nr 9: x5", "weight of number 9: 5 times"),
+        ("Sensor 2 quadruple, sensor 7 tenfold", "Sensor 2 4 times, sensor 7 ten times"),
+        ("Weigh it at a quarter, it doesnt matter", "Weigh it at 0.250 times, it doesn't matter"),
+        ("H2S at sensor 2, see it every minute and a half", "gas at sensor 2, see it every 1.5 minutes"),
+        ("Avoid 5 and 7 m/s, these two speeds shake", "Avoid 5 and 7 m/s, these speeds shake"),
+        ("Twenty steps may pass between two calls on sensor 6", "twenty steps may pass between calls on sensor 6"),
+    ],
+)
+def test_other_spellings_and_slips_are_read_as_usual_words(note: str, read: str) -> None:
+    assert phrased(note).text == read
+
+
+@pytest.mark.parametrize(
+    ("note", "read"),
+    [
+        ("The valve by sensor 8 was repaired. I want it inspected every half minute.", {"visit:8": 3}),
+        ("Oil film seen at sensor 6. I need eyes on it every 4 steps.", {"visit:6": 4}),
+        ("Anywhere from 3 to 10 m/s is fine by me.", {"min_velocity": 3, "max_velocity": 10}),
+        ("Keep it moving: 4 m/s or more, everyone.", {"min_velocity": 4}),
+        ("Sensor 0 delivers only noise; please disregard it.", {"weight:0": 0}),
+        ("Could we give sensor 6 a weight of 2.25 times the usual?", {"weight:6": 2.25}),
+        ("Is it possible to give sensor 7 a weight of 6?", {"weight:7": 6}),
+        ("Would it be ok if the drones fly with maximum 6 m/s?", {"max_velocity": 6}),
+        ("Go to sensor 9 every 6 steps, they hit anything slow.", {"visit:9": 6}),
+    ],
+)
+def test_reasons_and_politeness_leave_no_doubt(note: str, read: dict[str, float]) -> None:
+    meant = Guidance.of(read, {})
+    assert phrased(note).completed(meant, {0.5, 8.0, 7.0, 6.0, 4.0, 9.0, *read.values()}) == (meant, [])
+
+
+@pytest.mark.parametrize(
+    ("note", "read"),
+    [
+        ("UAV 2 alone should slow down to 5 m/s.", {"max_velocity": 5}),
+        ("UAV 1 looks after sensor 6 every 3 steps.", {"visit:6": 3}),
+        ("Only UAV 2 goes to sensor 5, the others stay away.", {f"weight:{sensor}": 0 for sensor in range(5)}),
+    ],
+)
+def test_what_one_uav_should_do_is_no_order(note: str, read: dict[str, float]) -> None:
+    with pytest.raises(BadOrders, match="may end an order or mean a part of the fleet"):
+        phrased(note).completed(Guidance.of(read, {}), {2.0, *read.values()})
+
+
+def test_a_condition_with_a_number_is_quoted() -> None:
+    with pytest.raises(BadOrders, match="asks or has a condition"):
+        phrased("If the wind picks up beyond 40 km/h, slow down to 5 m/s.").completed(NO_GUIDANCE, ())
+
+
+def test_an_order_is_not_taken_out_of_a_sentence_that_goes_on_about_its_sensor() -> None:
+    assert not phrased("Go to sensor 9 every 6 steps and let its losses count fivefold.").orders
+    assert phrased("Go to sensor 9 every 6 steps and stay below 5 m/s.").orders
