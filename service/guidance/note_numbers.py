@@ -41,7 +41,7 @@ _NUMBER = re.compile(
     r"|(?P<digits>\d+(?:\.\d+)?)(?P<suffix>(?:st|nd|rd|th)\b)?"
     r"|(?<!per )(?<!\ba )(?P<second>\bsecond\b)"
     r"|(?<=every )(?P<alternate>other|alternate)\b"
-    r"|(?<!quick )(?<!that )(?<!this )(?<!last )(?<!another )(?<!other )(?<!new )\bone\b"
+    r"|(?<!quick )(?<!that )(?<!this )(?<!last )(?<!another )(?<!other )(?<!new )\bone\b(?! of )"
     r"|\b(?P<some>(?:a )?(?:couple(?: of)?|dozen))\b"
     rf"|\b(?P<tens>{_any(_TENS)})[- ](?P<ones>{_any(CARDINALS[1:10])})\b"
     rf"|\b(?P<word>{_any({*CARDINALS, *ORDINALS, *_TENS, *_FACTORS} - {'second', 'one'})})\b"

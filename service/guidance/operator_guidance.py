@@ -197,7 +197,7 @@ class OperatorGuidance:
         after = self.confirmed if waits is None else self._after(waits)
         changed = {} if waits is None else self._changes(waits, after)
         in_words = None if self._proposed is None else self._proposed.in_words()
-        if self._withdrawn and not self._proposed:
+        if in_words and not self._proposed and (self._withdrawn or self.confirmed):
             in_words = "No new order."
         return GuidanceStatus(
             mission_id=mission_id,

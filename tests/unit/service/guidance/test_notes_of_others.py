@@ -17,6 +17,7 @@ from tests.unit.service.guidance.test_note_phrases import phrased
         ("Sensor 2 quadruple, sensor 7 tenfold", "Sensor 2 4 times, sensor 7 ten times"),
         ("Weigh it at a quarter, it doesnt matter", "Weigh it at 0.250 times, it doesn't matter"),
         ("H2S at sensor 2, see it every minute and a half", "gas at sensor 2, see it every 1.5 minutes"),
+        ("all three drones below 9 m/s, we need one reading", "all drones below 9 m/s, we need a reading"),
         ("Avoid 5 and 7 m/s, these two speeds shake", "Avoid 5 and 7 m/s, these speeds shake"),
         ("Twenty steps may pass between two calls on sensor 6", "twenty steps may pass between calls on sensor 6"),
     ],

@@ -56,6 +56,9 @@ def test_plain_notes_are_read(note: str, values: dict[str, float]) -> None:
         "Sensor 4 every 5 seconds.",
         "Fine work, everyone.",
         "Ignore it.",
+        "Never visit sensor 4 every 3 steps.",
+        "Sensor 4 need not be visited every 3 steps.",
+        "Stop checking sensor 4 every 3 steps.",
         "Half the sheep drink by sensor 0, so see it every fifteen steps.",
         "Visit sensor 4 twice every 10 steps.",
         "Weight 8 for sensor 3 and 10 for sensor 9.",
@@ -63,6 +66,89 @@ def test_plain_notes_are_read(note: str, values: dict[str, float]) -> None:
     ],
 )
 def test_what_is_not_plain_is_not_read(note: str) -> None:
+    assert plain_reading(note, PAPER) is None
+
+
+# Denials, reports, opinions, conditions, corrections, and what no UAV does.
+_NO_ORDERS = """\
+The old plan had sensor 4 visited every 3 steps.
+Somebody proposed to visit sensor 4 every 3 steps, but I disagree.
+I doubt that sensor 4 needs a look every 3 steps.
+Should sensor 4 get a visit every 3 steps?
+Sensor 4 gets a visit every 3 steps, right?
+Sensor 4 is visited every 3 steps already.
+We currently see sensor 4 every 3 steps.
+Sensor 4 sends a packet every 3 steps.
+The pump near sensor 4 starts every 3 steps.
+Sensor 4 loses a packet every 3 steps.
+Sensor 4 every 3 steps is too much.
+Every 3 steps at sensor 4 is overkill.
+Sensor 4 every 3 steps? No way.
+Not sensor 4 every 3 steps, sensor 5 every 3 steps.
+Sensor 4, no, sensor 5, every 3 steps.
+Sensor 4 every 3 steps, sorry, I mean sensor 5.
+Sensor 4 every 3 steps, or better every 5.
+Sensor 4 weighs 3 kilos.
+The value of sensor 4 is 3 today.
+Sensor 4 reads 3.
+Weight of sensor 4: unchanged, sensor 5: 3.
+Losses at sensor 4 doubled.
+Sensor 4 lost twice as many packets as sensor 5.
+Data from sensor 4 is half gone.
+The max speed of the old fleet was 9 m/s.
+Wind is at most 9 m/s.
+Gusts up to 9 m/s are expected.
+The wind blows with 12 m/s at most.
+Our UAVs can fly at most 15 m/s.
+Don't limit them to 9 m/s.
+9 m/s at most is nonsense.
+Who said at most 9 m/s?
+The limit is not 9 m/s but 12 m/s.
+Max 9 m/s, sorry, 12 m/s.
+Sensor 4 is not dead.
+Sensor 4 isn't broken any more.
+Sensor 4 was broken, now it works.
+Nobody ignores sensor 4.
+Do not leave sensor 4 out.
+Why would we skip sensor 4?
+I would never drop sensor 4.
+Hovering is not forbidden.
+It is not forbidden to hover.
+They never hover anyway.
+No hovering problems so far.
+Sensor 4 counts three times when wet.
+Sensors 4 and 5 together count three times.
+Either sensor 4 every 3 steps or every 5.
+Skip every third visit to sensor 4.
+Visit sensor 4 every 3 steps less often.
+Visit sensor 4 every 3 steps more.
+Visit sensor 4 three steps later.
+Visit sensor 4 3 steps after sensor 5.
+All but sensor 4 every 3 steps.
+Every sensor except 4 every 3 steps.
+Keep 5 m/s distance from the max 9 m/s.
+Two UAVs to sensor 4 every 3 steps.
+Send 2 drones to sensor 4 every 3 steps.
+UAV A to sensor 4 every 3 steps.
+The blue drone visits sensor 4 every 3 steps.
+Sensor 4 every 3 steps at night.
+Sensor 4 every 3 steps after the rain.
+Sensor 4 every 3 steps once the crew has left.
+Photograph sensor 4 every 3 steps.
+Warn me about sensor 4 every 3 steps.
+Restart sensor 4 every 3 steps.
+Avoid sensor 4 every 3 steps.
+Keep away from sensor 4, every 3 steps is enough for sensor 5.
+Slow down to 5 m/s at sensor 4.
+At sensor 4 nobody flies faster than 5 m/s.
+Sensor 4 needs a factor of 3 fewer visits.
+Sensor 4's packets are worth nothing compared to sensor 5.
+Half the fleet visits sensor 4 every 3 steps.
+"""
+
+
+@pytest.mark.parametrize("note", _NO_ORDERS.splitlines())
+def test_what_only_looks_like_an_order_is_not_read(note: str) -> None:
     assert plain_reading(note, PAPER) is None
 
 
