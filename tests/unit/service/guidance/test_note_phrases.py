@@ -328,6 +328,7 @@ def test_an_end_is_that_of_its_own_words(note: str, words: str) -> None:
             ["No order has an exception: “except visit 4”; where a withdrawal has one, withdraw order by order."],
         ),
         ("If it rains, slow down to 5 m/s", ["No order has a condition: “if it rains”."]),
+        ("Visit sensor 8 every 3 steps. Forget it.", ["The note may take back what it says: “forget it”."]),
         ("fly at 12 m/s, at least 5 m/s, above 9 mph until step 20", []),
         ("If nobody was at sensor 4 for six steps, go there.", []),
         ("visit sensor 4 for the next 5 steps as often as you can if you like", []),

@@ -71,6 +71,14 @@ def test_what_is_not_plain_is_not_read(note: str) -> None:
 
 # Denials, reports, opinions, conditions, corrections, and what no UAV does.
 _NO_ORDERS = """\
+During the night shift the fleet never went above 8 m/s.
+I am NOT asking you to ignore sensor 5.
+Don't bother doubling the weight of sensor 3, it is fine as it is
+Do keep them under 10 m/s, strictly under.
+Personally I think sensor 0 deserves twice the weight, but it's not my call.
+The inspector said "no faster than 5 m/s" and we all laughed.
+Ken shouted 'skip sensor 8, it's junk!' Ken doesn't run this place. Carry on.
+"Sensor 1 every 2 steps" is what day shift wrote on the board.
 The old plan had sensor 4 visited every 3 steps.
 Somebody proposed to visit sensor 4 every 3 steps, but I disagree.
 I doubt that sensor 4 needs a look every 3 steps.
