@@ -41,6 +41,7 @@ def phrased(note: str) -> PhrasedNote:
         ("Remove the orders for sensor 4", ["visit:4", "weight:4"]),
         ("There's no need to keep popping over to sensor 4 anymore.", ["visit:4"]),
         ("Stop ignoring sensor 7.", ["weight:7"]),
+        ("Control room has what it needed, 7 can go back to normal.", ["weight:7"]),
         ("Treat sensor 7 like any other sensor.", ["weight:7"]),
         ("Drop everything we had before.", ["*"]),
         ("Forget all the orders I gave you earlier", ["*"]),
@@ -227,6 +228,7 @@ def test_a_list_of_visits_with_one_verb_is_for_the_llm() -> None:
 
 def test_one_visit_in_the_midst_of_a_sentence_is_read() -> None:
     for note in (
+        "Get me one look at sensor 9 when you can, the farmer called.",
         "They smell gas, so get a drone over to sensor 9 right away, just the once.",
         "If it is not too much trouble, one of them, any of them, could drop by sensor 9 just a single time",
         "Could one of the drones check on sensor 9 just the one time? Whenever it fits.",
