@@ -24,6 +24,8 @@ PAPER = SCENARIOS["paper"]
         ("All sensors want a flyover each 8 steps.", {f"visit:{sensor}": 8 for sensor in range(10)}),
         ("At least 3 m/s, please, and sensor 8 gets weight 4.", {"min_velocity": 3, "weight:8": 4}),
         ("Gusts, so nobody goes quicker than 54 km/h.", {"max_velocity": 15}),
+        ("Gusty up over the roof, please don't let them go over 9 m/s.", {"max_velocity": 9}),
+        ("The line worries me, so sensor 3 counts double compared to the rest.", {"weight:3": 2}),
         ("Cap: 13 m/s.", {"max_velocity": 13}),
         ("Window for the speed: no less than 5, no more than 12 m/s.", {"min_velocity": 5, "max_velocity": 12}),
         ("Let them fly between 3 and 10 m/s.", {"min_velocity": 3, "max_velocity": 10}),
