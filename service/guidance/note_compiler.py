@@ -5,10 +5,9 @@ is constrained to the orders that the note's numbers allow. The answer is parsed
 does not match the note, or that the fleet cannot follow, is refused, and the LLM is asked again a few times. Without an
 LLM no note is compiled.
 
-An embedded LLM with the orders' adapter reads the note. If it reads the same as the rules of
-:mod:`service.guidance.plain_reading`, the reading is certain. Else it reads the note twice more, each time with other
-letters for its numbers, so that an answer caused by a letter does not recur. The most frequent reading is the note's,
-and has a doubt.
+An embedded LLM with the orders' adapter reads the note up to three times, each time with other letters for its numbers,
+so that an answer caused by a letter does not recur. A reading that the rules of :mod:`service.guidance.plain_reading`
+share is certain, and ends the search. Else the rules' reading, or without one the LLM's most frequent, has a doubt.
 
 Compiling runs concurrently with decisions, and no decision waits for it. The embedded model answers one request at a
 time and serves decisions first.
@@ -55,8 +54,8 @@ async def read_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReadi
     """The note's reading.
 
     Raises:
-        BadOrders: most answers are no orders, or the note is unclear.
-        Impossible: most answers order something that the fleet cannot do.
+        BadOrders: no rule reads the note, and most answers are no orders or find it unclear.
+        Impossible: likewise, and most answers order something that the fleet cannot do.
         NoDecision: the LLM gave no answer.
     """
     plain = plain_reading(note, scenario)
