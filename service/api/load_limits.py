@@ -118,7 +118,8 @@ class RequestLimits:
                 return None
             if encoding in _DECODERS:
                 body = _DECODERS[encoding](body, self._limit)
-            if len(list(islice(_NAME.finditer(body), _MOST_NAMES + 1))) > _MOST_NAMES:
+            # Few bodies have so many colons, and counting these takes a tenth of the time.
+            if body.count(b":") > _MOST_NAMES < len(list(islice(_NAME.finditer(body), _MOST_NAMES + 1))):
                 raise _TooManyParts(f"has more than {_MOST_NAMES} names")
             if body.count(b"[") + body.count(b"{") > _MOST_LISTS:
                 raise _TooManyParts(f"has more than {_MOST_LISTS} lists and objects")

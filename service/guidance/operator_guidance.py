@@ -118,6 +118,8 @@ class OperatorGuidance:
             first: the first step whose decisions are all without them.
             visits: the step of each sensor's last visit that succeeded, by sensor ID; -1 for never.
         """
+        if not self.confirmed.ends:
+            return False
         now = datetime.now(UTC)
         over = [
             name

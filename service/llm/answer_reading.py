@@ -35,6 +35,8 @@ _UNCLOSED = re.compile(rf"\A\s*[<\[]{_TAG}", re.IGNORECASE)
 _CLOSING = re.compile(rf"[<\[]/{_TAG}", re.IGNORECASE)
 _FINAL = re.compile(r".*<\|channel\|>final[^<]*<\|message\|>", re.DOTALL)
 _SPECIAL = re.compile(r"(?:<[|\uff5c][^<>]{1,40}[|\uff5c]>|</s>|<end_of_turn>)\Z")
+# Nothing of the above is in it.
+_PLAIN = re.compile(r"[a-zA-Z0-9 .,:;+-]*")
 _LONGEST_SPECIAL, _FENCE = 44, "```"
 _WRAPPED = re.compile(r"""\A\s*(?:\*\*(.*)\*\*|"(.*)"|\\boxed\{(.*)\})\s*\Z""", re.DOTALL)
 _ODD_BLANKS = str.maketrans({"\ufeff": None, "\u200b": None, "\u00a0": " "})
@@ -193,6 +195,8 @@ def streamed(content: bytes | bytearray) -> Any:
 
 def _without_thoughts(text: str) -> str:
     """A text without thoughts, special tokens and marks around its answer; empty if the thoughts have no end."""
+    if _PLAIN.fullmatch(text):
+        return text
     text = _without_specials(text.translate(_ODD_BLANKS))
     if "<|message|>" in text:
         final = _FINAL.match(text)

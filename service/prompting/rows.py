@@ -1,6 +1,7 @@
 """A sensor's row in the prompt: its columns, as comma-separated numbers."""
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,7 @@ def cells(state: State, rows: Sequence[int] | NDArray[np.int64]) -> list[dict[st
     ]
 
 
+@lru_cache(maxsize=16)
 def whole_numbers(state: State) -> tuple[tuple[str, ...], NDArray[np.int64]]:
     """The columns' names, and their numbers ``(columns, J)`` as they are written."""
     columns = full_columns(state)

@@ -27,7 +27,7 @@ class TokenCounter:
     def account(self, prompt: Prompt) -> Tokens:
         """The length of each block of a prompt, and the prompt's length without pruning."""
         static = self.count_repeated(prompt.static)
-        experiences = sum(self.count_repeated(line) for line in prompt.experiences.splitlines(keepends=True))
+        experiences = sum(map(self.count_repeated, prompt.experiences.splitlines(keepends=True)))
         rows = prompt.uncompressed.tokens_by_row(self.count_repeated)
         head = self.count(prompt.uncompressed.head)
         state = self.count(prompt.state) if prompt.kept is None else head + int(rows[[*prompt.kept]].sum())

@@ -48,10 +48,12 @@ class UnprunedState:
         """``count(line)`` of the sensors' lines ``(J,)``; o200k_base splits digits and lines as this does."""
         names, numbers = whole_numbers(self.state)
         needs_beacon, place_values = _columns(names)
-        unknown = needs_beacon[:, None] & ~self.state.heard
-        sizes, longer = np.where(unknown, 0, np.abs(numbers)), 1000
-        kinds = place_values @ np.where(unknown, 2, numbers < 0)
-        tokens = np.zeros_like(kinds)
+        sizes, longer, signs = np.abs(numbers), 1000, (numbers < 0).astype(np.int64)
+        if not self.state.heard.all():
+            unknown = needs_beacon[:, None] & ~self.state.heard
+            sizes[unknown], signs[unknown] = 0, 2
+        kinds = place_values @ signs
+        tokens = np.empty_like(kinds)
         for kind in set(kinds.tolist()):
             tokens[kinds == kind] = count(_example_row(self.write, names, kind))
         # The tokenizer makes one token of every three digits.

@@ -9,11 +9,13 @@ so that it takes 17 MB and starts in a twentieth of a second.
 """
 
 import os
+import select
 import signal
 import socket
 import sqlite3
 import struct
 import sys
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
@@ -26,6 +28,9 @@ LENGTH = struct.Struct("<I")
 BUSY_MS = 1000
 # WAL: readers and the writer do not wait for each other. FULL: a commit survives a power failure.
 PRAGMAS = ("journal_mode=WAL", "synchronous=FULL", f"busy_timeout={BUSY_MS}")
+# Looking at the log's times makes the next commit a quarter slower, because the file system must then write exact ones
+# (Linux 6.13, multigrain timestamps). So it is looked at after this pause, and in a busy store after this time.
+_PAUSE_MS, _LOOK_S = 3, 0.05
 
 
 def framed(message: Any) -> bytes:
@@ -53,6 +58,9 @@ def _facts(file: str) -> Facts:
     return (found.st_dev, found.st_ino, found.st_nlink), (found.st_size, found.st_mtime_ns)
 
 
+_CHANGED = "another program has changed the store's file: restart the edge"
+
+
 class Displaced(Exception):
     """A file of the store was deleted, replaced or hard-linked, and may be put back."""
 
@@ -63,9 +71,14 @@ class Changed(Exception):
 
 def serve(edge: socket.socket, path: str, epoch: int, known: Mapping[str, Identity]) -> None:
     """Commit the transactions that the edge sends, until it closes the socket; arguments as :class:`Database`."""
-    database = Database(path, epoch, known)
+    database, waiting = Database(path, epoch, known), select.poll()
+    waiting.register(edge, select.POLLIN)
     with edge.makefile("rb") as sent:
-        while len(head := sent.read(LENGTH.size)) == LENGTH.size:
+        while True:
+            if not waiting.poll(_PAUSE_MS):
+                database.look()
+            if len(head := sent.read(LENGTH.size)) < LENGTH.size:
+                break
             (length,) = LENGTH.unpack(head)
             if len(transaction := sent.read(length)) < length:
                 break
@@ -90,23 +103,32 @@ class Database:
         self._epoch = epoch
         self._known = known
         self._db: sqlite3.Connection | None = None
-        # The file, and after a commit its write-ahead log, as this connection left them.
+        # The version of the file's content, which changes when another program writes it.
+        self._version: int | None = None
+        # The file, and after a commit its write-ahead log, as this connection left them at the last look.
         self._left: list[Facts] = []
+        self._looked, self._looked_at = False, 0.0
 
     def commit(self, transaction: list[tuple[str, list[Any]]]) -> tuple[str, bool, bool] | None:
         """Commit a transaction; returns None, or the arguments of ``WriteFailed`` if nothing of it was committed."""
         try:
             db = self._db or self._open()
-            if len(self._left) > 1 and self._inspect(db) != self._left:
-                raise Changed("another program has changed the store's file: restart the edge")
+            if self._looked and self._inspect(db) != self._left:
+                raise Changed(_CHANGED)
             db.execute("BEGIN IMMEDIATE")
-            if db.execute("PRAGMA user_version").fetchone()[0] != self._epoch:
-                raise Changed("another edge has opened the store's file: end one of them, and restart the other")
+            if (version := db.execute("PRAGMA data_version").fetchone()[0]) != self._version:
+                if db.execute("PRAGMA user_version").fetchone()[0] != self._epoch:
+                    raise Changed("another edge has opened the store's file: end one of them, and restart the other")
+                if self._version is not None:
+                    raise Changed(_CHANGED)
+                self._version = version
             for sql, rows in transaction:
                 db.executemany(sql, rows)
             db.execute("COMMIT")
-            self._left = self._inspect(db)
-            self._check_known(self._path)
+            self._looked = False
+            self._check_known()
+            if time.monotonic() > self._looked_at + _LOOK_S:
+                self._look(db)
         except Exception as error:
             self.close()
             # Damage is of this class itself; a full disk or a lock is of a class below it.
@@ -114,13 +136,25 @@ class Database:
             return str(error) or type(error).__name__, final or isinstance(error, Displaced), final
         return None
 
+    def look(self) -> None:
+        """Note how the last commit has left the file and its log, for the next one to compare."""
+        if self._db is not None and not self._looked:
+            try:
+                self._look(self._db)
+            except (Displaced, sqlite3.Error):
+                # The next commit opens the file again, if it is the same.
+                self.close()
+
     def close(self) -> None:
         """Close the connection; an open transaction is rolled back."""
         if self._db is not None:
             with suppress(sqlite3.Error):
                 self._db.close()
             self._db = None
-        self._left = []
+        self._left, self._looked, self._version = [], False, None
+
+    def _look(self, db: sqlite3.Connection) -> None:
+        self._left, self._looked, self._looked_at = self._inspect(db), True, time.monotonic()
 
     def _inspect(self, db: sqlite3.Connection) -> list[Facts]:
         """The file and its log; raises ``Displaced`` if the next edge will not open the same ones."""
@@ -134,9 +168,9 @@ class Database:
             raise _displaced(log)
         return found
 
-    def _check_known(self, but: str = "") -> None:
+    def _check_known(self) -> None:
         for file, known in self._known.items():
-            if file != but and identity(file) != known:
+            if identity(file) != known:
                 raise _displaced(file)
 
     def _open(self) -> sqlite3.Connection:

@@ -81,8 +81,8 @@ class Arrivals:
         """Expected arrivals of sensors ``(n,)`` from ``steps`` ``(n,)`` to a step, packets."""
         rate = self.rate[which]
         came = rate * np.maximum(step - steps, 0)
-        if self.in_bursts:
-            at, above = self.recent_at[which], np.maximum(self.recent[which] - rate, 0.0)
+        if self.in_bursts and (above := np.maximum(self.recent[which] - rate, 0.0)).any():
+            at = self.recent_at[which]
             came += _still_to_come(above, np.minimum(steps, step) - at) - _still_to_come(above, step - at)
         return came
 

@@ -48,12 +48,14 @@ class Records:
         Between two beacons of a sensor without a visit or an overflow, the queue grows by the arrivals.
         """
         before = self._seen[ids]
-        newer = np.flatnonzero(seen > before)
-        ids, seen, queue, before = ids[newer], seen[newer], queue[newer], before[newer]
+        newer = (seen > before).nonzero()[0]
+        if len(newer) < len(ids):
+            ids, seen, queue, before = ids[newer], seen[newer], queue[newer], before[newer]
         last, undisturbed = self._queue[ids], (before >= 0) & (self.visits[ids] < before)
         grown = undisturbed & (last <= queue) & (queue < self._capacity)
-        self._arrivals[ids[grown]] += (queue - last)[grown]
-        self._exposure[ids[grown]] += (seen - before)[grown]
+        if len(of := ids[grown]):
+            self._arrivals[of] += (queue - last)[grown]
+            self._exposure[of] += (seen - before)[grown]
         self._seen[ids], self._queue[ids] = seen, queue
 
     def presume(self, sensor_id: int, decision_id: str, step: int) -> None:

@@ -54,7 +54,7 @@ class Reach:
         return np.asarray(self.links.hold >= LIKELY)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class State:
     """One UAV's view at one step; arrays have shape ``(J,)``, ``places`` ``(J, 2)``, in the request's order.
 
