@@ -62,7 +62,10 @@ def cells(state: State, rows: Sequence[int] | NDArray[np.int64]) -> list[dict[st
 def whole_numbers(state: State) -> tuple[tuple[str, ...], NDArray[np.int64]]:
     """The columns' names, and their numbers ``(columns, J)`` as they are written."""
     columns = full_columns(state)
-    return tuple(columns), np.rint([*columns.values()]).astype(np.int64)
+    numbers = np.empty((len(columns), len(state.ids)))
+    for row, column in zip(numbers, columns.values(), strict=True):
+        np.rint(column, out=row)
+    return tuple(columns), numbers.astype(np.int64)
 
 
 def full_columns(state: State) -> dict[str, NDArray[Any]]:

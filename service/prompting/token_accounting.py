@@ -9,6 +9,8 @@ from service.prompting.prompt import Prompt
 from service.prompting.tokenizer import ENCODING, encoding
 from shared.wire.schemas import Tokens
 
+_SAME_DIGITS = str.maketrans(dict.fromkeys("0123456789", "5"))
+
 
 class TokenCounter:
     """Counts tokens with tiktoken's ``o200k_base`` (GPT-4o-mini's), from a vocabulary on disk."""
@@ -17,8 +19,10 @@ class TokenCounter:
 
     def __init__(self, cache_dir: Path) -> None:
         self._encoding = encoding(cache_dir)
-        # The static block and the experiences recur with every decision; the state never does.
-        self.count_repeated = lru_cache(maxsize=256)(self.count)
+        # The static block and most lines recur with every decision. A new line differs from earlier ones in its digits
+        # alone, and its tokens depend on the number of these: every number of up to three digits is one token.
+        self.count_repeated = alike = lru_cache(maxsize=4096)(self.count)
+        self.count_line = lru_cache(maxsize=4096)(lambda line: alike(line.translate(_SAME_DIGITS)))
 
     def count(self, text: str) -> int:
         """Tokens of a text; special tokens are counted as plain text."""
@@ -27,9 +31,9 @@ class TokenCounter:
     def account(self, prompt: Prompt) -> Tokens:
         """The length of each block of a prompt, and the prompt's length without pruning."""
         static = self.count_repeated(prompt.static)
-        experiences = sum(map(self.count_repeated, prompt.experiences.splitlines(keepends=True)))
+        experiences = sum(map(self.count_line, prompt.experiences.splitlines(keepends=True)))
         rows = prompt.uncompressed.tokens_by_row(self.count_repeated)
-        head = self.count(prompt.uncompressed.head)
+        head = self.count_line(prompt.uncompressed.head)
         state = self.count(prompt.state) if prompt.kept is None else head + int(rows[[*prompt.kept]].sum())
         state_uncompressed = head + int(rows.sum())
         return Tokens(

@@ -53,8 +53,6 @@ class Arrivals:
 
     def take(self, ids: IntArray, came: FloatArray, steps: IntArray, at: IntArray) -> None:
         """Add arrivals ``(n,)``, packets, at sensors ``(n,)``, each once, over ``steps`` steps up to step ``at``."""
-        from shared.belief.arrivals import take_arrivals
-
         surprises = np.empty(len(ids))
         arrays = self.arrived, self.watched, self.rate, self.recent, self.recent_at
         take_arrivals(*arrays, ids, came, steps, at, surprises)

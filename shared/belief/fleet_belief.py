@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.belief.arrivals import Arrivals
+from shared.belief.arrivals import Arrivals, in_range, take_beacons
 from shared.belief.drift import Drift
 from shared.belief.learned_channel import ExpectedLinks, LearnedChannel
 from shared.world.channel import FloatArray, IntArray
@@ -149,8 +149,6 @@ class FleetBelief:
             queue: shape ``(n,)``, packets at the start of that step.
             battery: shape ``(n,)``, joules.
         """
-        from shared.belief.arrivals import take_beacons
-
         # numpy raises an error for an unknown sensor ID; compiled code would not.
         self.places[ids] = places
         if not len(ids) == len(beacon) == len(queue) == len(battery):
@@ -191,8 +189,6 @@ class FleetBelief:
         The transmission of the UAV's last step was over the same link as the beacon now. If it failed although that
         link is good, the sensor's radio failed.
         """
-        from shared.belief.arrivals import in_range
-
         last = self.uavs[uav]
         if last.taught == last.step:
             return NOTHING_MEASURED

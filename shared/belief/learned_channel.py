@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from shared.belief import link_expectations
 from shared.belief.radio_map import RadioMap
 from shared.world.channel import FloatArray, IntArray, LinkBudget, path_loss_db
 from shared.world.scenario import Point, Scenario
@@ -50,11 +51,9 @@ class ExpectedLinks:
     @classmethod
     def by_formula(cls, distance: FloatArray, scenario: Scenario) -> Self:
         """The links of the mean path loss at distances ``(P, n)``."""
-        from shared.belief.link_expectations import formula_transfers
-
         world = LinkBudget.of(scenario)
         packets, hold = np.empty(distance.shape, dtype=np.int64), np.empty(distance.shape)
-        formula_transfers(world, *_rings(world), np.ascontiguousarray(distance), packets, hold)
+        link_expectations.formula_transfers(world, *_rings(world), np.ascontiguousarray(distance), packets, hold)
         return cls(distance, packets, hold)
 
     @property
@@ -66,10 +65,8 @@ class ExpectedLinks:
 @lru_cache(maxsize=64)
 def _rings(world: LinkBudget) -> tuple[IntArray, FloatArray]:
     """What :func:`shared.belief.link_expectations.know_rings` writes, computed once for a scenario."""
-    from shared.belief.link_expectations import know_rings
-
     packets, hold = np.empty(_RINGS, dtype=np.int64), np.empty(_RINGS)
-    know_rings(world, packets, hold)
+    link_expectations.know_rings(world, packets, hold)
     return packets, hold
 
 
@@ -141,10 +138,8 @@ class LearnedChannel:
         Returns:
             their excess losses over the formula, dB.
         """
-        from shared.belief.link_expectations import measured_excess
-
         excess_db = np.empty(len(ids))
-        measured_excess(self._budget, np.array(distance), np.array(gain_db), excess_db)
+        link_expectations.measured_excess(self._budget, np.array(distance), np.array(gain_db), excess_db)
         return self.radio_map.measure(ids, place, excess_db)
 
     def links(self, places: FloatArray, distance: FloatArray, ids: IntArray | None = None) -> ExpectedLinks:
@@ -163,11 +158,11 @@ class LearnedChannel:
 
     def _transfers(self, places: FloatArray, metres: FloatArray, which: IntArray) -> tuple[IntArray, FloatArray]:
         """Packets and margins of links, as :class:`ExpectedLinks` has them, ``(P, n)`` each, to sensors ``(n,)``."""
-        from shared.belief.link_expectations import expected_transfers
-
         mean, deviation = self.radio_map.predict(places, which)
         packets, margin = np.empty(metres.shape, dtype=np.int64), np.empty(metres.shape)
-        expected_transfers(self._budget, self.share, np.ascontiguousarray(metres), mean, deviation, packets, margin)
+        link_expectations.expected_transfers(
+            self._budget, self.share, np.ascontiguousarray(metres), mean, deviation, packets, margin
+        )
         return packets, margin
 
     def packets(self, position: Point, place: FloatArray, sensor: int, *, held: bool) -> int:
@@ -205,9 +200,7 @@ class LearnedChannel:
 
         The link is in radio range; no packets move where the loss is not below the threshold.
         """
-        from shared.belief.link_expectations import transfer
-
-        packet_j, packets = transfer(self._budget, loss_db)
+        packet_j, packets = link_expectations.transfer(self._budget, loss_db)
         return packet_j, packets if loss_db < self._scenario.path_loss_limit_db else 0
 
     def moved(self, packets: float, before: float, link: int, slack: float) -> None:

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from shared.belief.kriging import estimated, invert, predict, take_measurements
 from shared.belief.shadowing import (
     EAST,
     EXCESS,
@@ -17,6 +18,7 @@ from shared.belief.shadowing import (
     TAKEN,
     LinkStatistics,
     Measurements,
+    likelihoods,
 )
 from shared.world.channel import FloatArray, IntArray
 
@@ -115,9 +117,6 @@ class RadioMap:
         if self.exact and np.abs(excess).max() > _EXACT_DB:
             self.exact = False
             self._factor(np.arange(len(self.count)))
-        # Imported here, because commands that learn no channel should not load numba, which takes a fifth of a second.
-        from shared.belief.kriging import take_measurements
-
         east, north = np.asarray(place, dtype=np.float64).tolist()
         # A copy, because numba would recompile the function for a read-only array.
         take_measurements(self._measurements(), self._links(), np.array(ids), east, north, excess)
@@ -143,8 +142,6 @@ class RadioMap:
 
     def predict(self, places: FloatArray, which: IntArray) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation, dB, of the excess loss at places ``(P, 2)`` of sensors ``(n,)``: ``(P, n)``."""
-        from shared.belief.kriging import predict
-
         mean, deviation = np.empty((2, len(places), len(which)))
         work = np.empty((self._kept.shape[1] + 3, len(places)))
         east_north = np.ascontiguousarray(places.T, dtype=np.float64)
@@ -153,8 +150,6 @@ class RadioMap:
 
     def _factor(self, ids: IntArray) -> None:
         """Invert the covariances of these sensors' measurements, and estimate what all links have in common."""
-        from shared.belief.kriging import invert
-
         if not self._inverse.size:
             most = self._kept.shape[1]
             self._inverse = np.zeros((len(self._kept), most * (most + 1) // 2))
@@ -163,14 +158,10 @@ class RadioMap:
 
     def _estimate(self) -> None:
         """The offset and the deviation of all links."""
-        from shared.belief.kriging import estimated
-
         self.offset_db, self.deviation_db = estimated(self._kept, self.count)
 
     def _compare(self) -> None:
         """Choose the kind of shadowing with the highest marginal likelihood, the variance at its estimate."""
-        from shared.belief.shadowing import likelihoods
-
         self.kind = KINDS[int(np.argmax(likelihoods(self._kept, self.count)))]
         self._factor(np.flatnonzero(self.count))
 

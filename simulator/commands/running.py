@@ -37,15 +37,9 @@ def run_reporting_errors(prog: str, run: Callable[[Console], int]) -> int:
     try:
         with sigterm_interrupts():
             return run(Console())
-    except UsageError as error:
-        print(f"{prog}: {error}", file=sys.stderr)
-        return 2
-    except EdgeError as error:
+    except (UsageError, EdgeError, RunFailed) as error:
         print(f"{prog}: {error}{_remedy(error)}", file=sys.stderr)
-        return 1
-    except RunFailed as error:
-        print(f"{prog}: {error}", file=sys.stderr)
-        return 1
+        return 2 if isinstance(error, UsageError) else 1
     except OSError as error:
         print(f"{prog}: {error.strerror or error}{f': {error.filename}' if error.filename else ''}", file=sys.stderr)
         return 2
@@ -54,7 +48,7 @@ def run_reporting_errors(prog: str, run: Callable[[Console], int]) -> int:
         return INTERRUPTED
 
 
-def _remedy(error: EdgeError) -> str:
+def _remedy(error: Exception) -> str:
     """What to type next, after a semicolon; empty where that is unknown."""
     if isinstance(error, EdgeUnreachable):
         return "; start an edge with `aicvds serve`, or correct --edge"

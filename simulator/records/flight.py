@@ -80,17 +80,7 @@ def exchange_fields(exchange: Exchange | None) -> dict[str, Any]:
     if exchange is None:
         return {}
     answer = exchange.response
-    return {
-        "model": answer.model,
-        "decision_id": answer.decision_id,
-        "top_k": answer.top_k,
-        "trust": {} if answer.guided is None else answer.guided.trust,
-        "tokens": answer.tokens,
-        "latency_ms": answer.latency_ms,
-        "deadline_ms": answer.deadline_ms,
-        "rtt_ms": exchange.rtt_ms,
-        "attempts": exchange.attempts,
-        "request_bytes": exchange.request_bytes,
-        "response_bytes": exchange.response_bytes,
-        "attention_bytes": exchange.attention_bytes,
-    }
+    answered = ("model", "decision_id", "top_k", "tokens", "latency_ms", "deadline_ms")
+    measured = ("rtt_ms", "attempts", "request_bytes", "response_bytes", "attention_bytes")
+    fields = {name: getattr(answer, name) for name in answered} | {name: getattr(exchange, name) for name in measured}
+    return fields | {"trust": {} if answer.guided is None else answer.guided.trust}

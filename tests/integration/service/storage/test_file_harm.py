@@ -6,6 +6,7 @@ import os
 import resource
 import shutil
 import sqlite3
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from service.mission.events import GuidanceChanged
 from service.mission.resolved_spec import ResolvedSpec
 from service.storage.locks import StoreUnusable
 from service.storage.operations import Change, Entry, Made
+from service.storage.sqlite_process import Database, identity
 from service.storage.store import Store, cause
 from shared.wire.schemas import MissionSpec
 from tests.support.stored_missions import fly, running, writers, written
@@ -100,6 +102,8 @@ def test_a_commit_that_the_next_edge_may_not_find_is_not_stored(
     with running(path) as (client, _):
         assert client.post("/decide", json=report()).json()["stored"]
         assert client.get("/readyz").status_code == 200
+        # The writer looks at the log once it has nothing to write.
+        time.sleep(0.1)
         harm(path)
         assert not client.post("/decide", json=report(step=1)).json()["stored"]
         ready = client.get("/readyz")
@@ -135,6 +139,40 @@ def test_a_log_that_is_deleted_loses_nothing(tmp_path: Path, report: Report, cap
     assert "m.db-wal was deleted, replaced or hard-linked while the edge ran" in caplog.text
     with running(path) as (client, _):
         assert client.get("/missions/test").json()["decisions"] == 3
+
+
+@pytest.mark.parametrize(
+    ("harm", "reason", "commits"),
+    [
+        (lambda path: path.unlink(), f"m.db {DISPLACED}", 1),
+        (_written_by_another_program, CHANGED, 1),
+        # It is looked at twenty times a second.
+        (lambda path: path.with_name("m.db-wal").unlink(), f"m.db-wal {DISPLACED}", 1_000_000),
+    ],
+    ids=["deleted", "written by another program", "log deleted"],
+)
+def test_a_busy_store_knows_its_file_too(
+    tmp_path: Path, harm: Callable[[Path], object], reason: str, commits: int
+) -> None:
+    path = tmp_path / "m.db"
+    store = Store(str(path))
+    with sqlite3.connect(path) as db:
+        (epoch,) = db.execute("PRAGMA user_version").fetchone()
+    db.close()
+    database = Database(str(path), epoch, {str(path): identity(str(path))})
+    sql = "INSERT INTO missions VALUES (?, '', '')"
+    assert [database.commit([(sql, [[name]])]) for name in "abc"] == [None] * 3
+    harm(path)
+    ends = time.monotonic() + 5.0
+    found = next(
+        fault
+        for n in range(commits)
+        if (fault := database.commit([(sql, [[f"more{n}"]])])) is not None or time.monotonic() > ends
+    )
+    assert found is not None
+    assert found[0] == reason
+    database.close()
+    store.close()
 
 
 def test_a_commit_that_the_disk_refuses_is_written_later(tmp_path: Path, report: Report) -> None:

@@ -91,9 +91,11 @@ def test_the_uncompressed_state_is_counted_as_if_it_were_written(features: Featu
     drawn = random.Random(features)
     queue = [None if drawn.random() < 0.3 else float(int(10 ** drawn.uniform(0, 5)) - 1) for _ in range(300)]
     view = attended(m, uav(step=3000, x=[10 ** drawn.uniform(0, 6) for _ in queue], queue=queue), 3000)
-    prompt = m.template.prompt(view.state, view.shown(), [])
+    experiences = [f"{n},{n * n},-{n * 7},5,{n % 11} > {n} 9: {n / 10}\n" for n in range(0, 30_000, 977)]
+    prompt = m.template.prompt(view.state, view.shown(), experiences)
     tokens, whole = COUNTER.account(prompt), prompt.uncompressed
     assert len(whole.text.splitlines()) >= 300
+    assert tokens.experiences == COUNTER.count(prompt.experiences)
     assert tokens.state_uncompressed == COUNTER.count(whole.text)
     assert (prompt.kept, tokens.state) == (view.shown(), COUNTER.count(prompt.state))
     assert COUNTER.account(replace(prompt, kept=None)) == tokens
