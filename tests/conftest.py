@@ -63,8 +63,8 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     So long an edge waits for the end of the process that writes its store, too. One that outlives its edge is a
     ResourceWarning, and fails whatever test runs then.
     """
-    monkeypatch.setattr("service.edge.engine._STORE_S", PATIENCE_S)
-    monkeypatch.setattr("service.storage.process_writer._EXIT_S", PATIENCE_S)
+    monkeypatch.setattr("service.edge.engine.STORE_S", PATIENCE_S)
+    monkeypatch.setattr("service.storage.process_writer.EXIT_S", PATIENCE_S)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -30,7 +30,7 @@ _MAX_CLOCK_SKEW = timedelta(seconds=60)
 # Message IDs remembered for each device, to detect duplicates.
 _REMEMBERED_IDS = 8
 # Warnings at most, one a device and reason: anyone at the broker can make up devices.
-_MOST_WARNINGS = 10_000
+MOST_WARNINGS = 10_000
 # Field names in a warning, and characters of each.
 _NAMES_SHOWN, _NAME_LENGTH = 20, 60
 _EPOCH = datetime.min.replace(tzinfo=UTC)
@@ -140,7 +140,7 @@ class ReadingBuffer:
         return self._add_reading(uplink, state)
 
     def _unused(self, device: str, result: MessageResult, reason: str) -> MessageResult:
-        if (device, result) not in self._warned and len(self._warned) < _MOST_WARNINGS:
+        if (device, result) not in self._warned and len(self._warned) < MOST_WARNINGS:
             self._warned.add((device, result))
             log.warning("%s: %s: %s; further ones are only counted", _shown(device), result, reason)
         return result

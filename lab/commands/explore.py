@@ -32,7 +32,7 @@ TeacherOption = Literal["both", "planner", "clairvoyant"]
 _BEHAVIOUR = "taught: mostly the reference's; untaught: half a heuristic's, half a random sensor; a random velocity"
 
 # Seconds in which an edge loads its LLM.
-_READY_S = 30.0
+READY_S = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +121,7 @@ def _await_edge(url: str) -> None:
     from shared.client.edge_client import EdgeClient
 
     with EdgeClient(url) as client:
-        client.wait_ready(_READY_S)
+        client.wait_ready(READY_S)
 
 
 def _explored(scenario: Scenario, args: Explore) -> Iterator[RolloutStep]:

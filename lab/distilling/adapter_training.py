@@ -18,7 +18,7 @@ from shared.kit.cores import usable_cores
 
 _WARM_UP_STEPS = 30
 _MOST_GRADIENT = 1.0
-_CHECKPOINT_STEPS = 25
+CHECKPOINT_STEPS = 25
 # Steps whose mean loss is shown; a log has a line as often.
 _RECENT = 50
 
@@ -76,7 +76,7 @@ def train(
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(weights, _MOST_GRADIENT)
         optimizer.step()
-        if (step + 1) % _CHECKPOINT_STEPS == 0 or step + 1 == args.steps:
+        if (step + 1) % CHECKPOINT_STEPS == 0 or step + 1 == args.steps:
             half = checkpoint.with_suffix(".part")
             kept = {
                 "run": _run(examples, args),

@@ -21,7 +21,7 @@ from service.llm.model_file import embedded_model, sha256
 from service.prompting.compact_prompt import STATIC
 
 # Held-out decisions of each scenario that are evaluated.
-_EVALUATED = 300
+EVALUATED = 300
 
 
 def distill(args: Distill, console: Console) -> None:
@@ -54,7 +54,7 @@ def distill(args: Distill, console: Console) -> None:
 
 
 def _some(held: list[PromptExample]) -> list[PromptExample]:
-    return random.Random(0).sample(held, min(_EVALUATED, len(held)))
+    return random.Random(0).sample(held, min(EVALUATED, len(held)))
 
 
 def _report(found: dict[str, Agreement], console: Console) -> None:

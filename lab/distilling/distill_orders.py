@@ -17,7 +17,7 @@ from service.guidance.lettered_orders import STATIC
 from service.llm.adapter_version import ORDERS
 from service.llm.model_file import embedded_model, sha256
 
-_EVALUATED = 300
+EVALUATED = 300
 # The seed of the held-out notes; training has others.
 _HELD_OUT_SEED = 1_000_000
 
@@ -36,7 +36,7 @@ def distill_orders(args: DistillOrders, console: Console) -> None:
     student = NoteStudent(gguf, STATIC, args.rank, device, args.begin)
     train_showing(student, training, args, console)
     seen, unseen = (
-        understanding(student, list(islice(note_examples(_HELD_OUT_SEED, held_out), _EVALUATED)))
+        understanding(student, list(islice(note_examples(_HELD_OUT_SEED, held_out), EVALUATED)))
         for held_out in (False, True)
     )
     console.print(f"Right: {seen.right:.1%} of {seen.notes} new notes by known phrasings", highlight=False)

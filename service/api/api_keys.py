@@ -34,7 +34,7 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 
 _PREFIX = "aicvds_"
 # Seconds between checks for changes of the file.
-_STALE_S = 1.0
+STALE_S = 1.0
 MOST_KEYS = 1000
 _MAX_BYTES = 4_000_000
 
@@ -175,7 +175,7 @@ class ApiKeys:
         return found
 
     def _refresh(self) -> None:
-        if self._clock() - self._checked_at < _STALE_S:
+        if self._clock() - self._checked_at < STALE_S:
             return
         self._checked_at = self._clock()
         stamp = self._stamp()

@@ -39,7 +39,7 @@ _SECURITY_HEADERS = {
 }
 EVENTS = "text/event-stream"
 _MOST_LISTED = 200
-_KEY_CHECK_S = 1.0
+KEY_CHECK_S = 1.0
 
 
 class Assets(StaticFiles):
@@ -91,7 +91,7 @@ class EventStream(StreamingResponse):
         checked_at = time.monotonic()
         async with aclosing(events):
             async for event in events:
-                if time.monotonic() - checked_at > _KEY_CHECK_S:
+                if time.monotonic() - checked_at > KEY_CHECK_S:
                     if not still_known():
                         return
                     checked_at = time.monotonic()

@@ -18,7 +18,7 @@ READING = ("GET", "HEAD")
 # key, so they must not take the places of other requests.
 _UNCOUNTED = re.compile(r"/(healthz|readyz|metrics|static/.*|missions/[^/]+/events)?")
 # While a body arrives, its request counts against the limit of concurrent requests.
-_BODY_S = 10.0
+BODY_S = 10.0
 # A batch has some thousand names of fields, a scenario at most 100,000 waypoints.
 _NAME, _MOST_NAMES, _MOST_LISTS = re.compile(rb'"\s*:'), 20_000, 120_000
 
@@ -108,7 +108,7 @@ class RequestLimits:
             await response(scope, receive, send)
             return None
         try:
-            async with asyncio.timeout(_BODY_S) as limit:
+            async with asyncio.timeout(BODY_S) as limit:
                 self._arriving[limit] = None
                 try:
                     body = await self._read(receive, headers.get(b"content-length", b""))
@@ -136,7 +136,7 @@ class RequestLimits:
         match fault:
             case TimeoutError():
                 status = 408
-                problem = f"not received within {_BODY_S:g} s, or in less while {self._most} requests are in progress"
+                problem = f"not received within {BODY_S:g} s, or in less while {self._most} requests are in progress"
             case _Damaged():
                 status, problem = 400, str(fault)
             case _TooManyParts():

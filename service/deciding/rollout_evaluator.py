@@ -30,7 +30,7 @@ from shared.world.urgency import VELOCITY_BONUS, urgency
 # Sampled futures. All candidates are flown through the same ones, so that arrivals cause no difference between them. On
 # 8 worlds of scenario `paper`, flying the best candidate of an earlier evaluator lost 38 packets with 8 futures, 33
 # with 24 and 30 with 48.
-_FUTURES = 48
+FUTURES = 48
 # Choices that one evaluation weighs at most; larger worlds get fewer futures.
 _MAX_ENTRIES = 20_000_000
 
@@ -316,7 +316,7 @@ def evaluate(state: RolloutState, candidates: Sequence[Action]) -> Evaluation:
     plans = {uavs.index(uav): actions for uav, actions in state.plans.items()}
     continuations = [{}, plans] if plans else [{}]
     entries = count * sensors * (scenario.max_velocity + 1) * len(uavs) * state.horizon * len(continuations)
-    futures = SampledFutures.of(state, int(np.clip(_MAX_ENTRIES // entries, 1, _FUTURES)))
+    futures = SampledFutures.of(state, int(np.clip(_MAX_ENTRIES // entries, 1, FUTURES)))
     world = FlownWorld.of(state)
     index = {int(sensor): row for row, sensor in enumerate(state.sensors)}
     # A sensor that is not simulated is out of every UAV's reach.

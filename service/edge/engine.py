@@ -33,7 +33,7 @@ from shared.wire.reasons import Reason
 from shared.wire.schemas import BatchRequest, DecideRequest, DecideResponse, FeedbackRequest, FeedbackResponse, Source
 
 # The longest wait of an answer for the disk; after that it is sent with `stored` false.
-_STORE_S = 1.0
+STORE_S = 1.0
 # Seconds for the last checkpoints, and for the last commit, when the service ends.
 _LAST_CHECKPOINTS_S, _LAST_COMMIT_S = 2.0, 2.5
 _ANSWERS = TypeAdapter(list[DecideResponse])
@@ -188,7 +188,7 @@ class Engine:
             raise _taken_over()
 
     async def _on_disk(self, field: str) -> None:
-        if not await self.journal.stored(_STORE_S):
+        if not await self.journal.stored(STORE_S):
             raise Unavailable(field, "not on disk yet: send it again to be sure")
 
     def _start(self, request: DecideRequest | BatchRequest) -> tuple[Stopwatch, Deadline]:
@@ -229,7 +229,7 @@ class Engine:
             else:
                 decisions, answers = await self._once(mission, request, key, make)
             began = time.perf_counter()
-            stored = await self.journal.stored(min(_STORE_S, deadline.at - began))
+            stored = await self.journal.stored(min(STORE_S, deadline.at - began))
             if self.journal.lost(mission):
                 raise _taken_over()
             waited_ms = round((time.perf_counter() - began) * 1e3, 3)

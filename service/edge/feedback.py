@@ -20,9 +20,9 @@ log = logging.getLogger(__name__)
 
 
 # Training tasks that may wait, a fraction of a millisecond each.
-_MAX_TASKS = 256
+MAX_TASKS = 256
 # Seconds between two warnings about skipped outcomes.
-_WARNING_S = 10.0
+WARNING_S = 10.0
 
 
 class Feedback:
@@ -136,7 +136,7 @@ class LearningQueue:
     @property
     def full(self) -> bool:
         """Whether the queue takes no more tasks."""
-        return len(self._waiting) >= _MAX_TASKS
+        return len(self._waiting) >= MAX_TASKS
 
     def add(self, task: TrainingTask) -> None:
         """Train two iterations of the event loop later, after the current decision's request to the LLM or the disk."""
@@ -159,7 +159,7 @@ class LearningQueue:
         self._skipped += 1
         if (now := time.monotonic()) >= self._next_warning_at:
             log.warning("learning falls behind: %d outcomes are not used for training", self._skipped)
-            self._skipped, self._next_warning_at = 0, now + _WARNING_S
+            self._skipped, self._next_warning_at = 0, now + WARNING_S
 
     def catch_up(self, mission: Mission) -> None:
         """Finish one mission's waiting training now."""

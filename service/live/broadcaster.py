@@ -30,7 +30,7 @@ _SHARE = 0.05
 _MOST_FRAMES, _MOST_BYTES = 30, 1_000_000
 # Decisions in a snapshot.
 _SHOWN = 300
-_HEARTBEAT_S = 5.0
+HEARTBEAT_S = 5.0
 # A listener that accepts nothing for this long has stopped reading. The limit is shorter while the service closes.
 _STALLED_S, _LAST_S = 20.0, 0.5
 
@@ -84,7 +84,7 @@ class MissionStream:
                 frame = self._frames[-missing]
                 at += 1
                 yield frame
-            elif not (await asyncio.wait({next_update}, timeout=_HEARTBEAT_S))[0]:
+            elif not (await asyncio.wait({next_update}, timeout=HEARTBEAT_S))[0]:
                 yield b": nothing new\n\n"
         if self.deleted:
             yield _event("gone", b"{}")

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_TOGETHER_TIMEOUT_S = 15.0
+TOGETHER_TIMEOUT_S = 15.0
 # More than the UAVs of any fleet.
 _ANY_NUMBER = 1000
 # No model names this sensor by itself, so a server that answers it obeys the constraint.
@@ -127,7 +127,7 @@ async def _answers_lists(
     lists = [["A", "B"], ["C", "D"]]
     body = label_body(model, "Answer in words.", _PROBE_TEXT, constraint, lists, logprobs)
     try:
-        async with asyncio.timeout(_TOGETHER_TIMEOUT_S):
+        async with asyncio.timeout(TOGETHER_TIMEOUT_S):
             found = await _answer(client, body)
     except TimeoutError:
         return False

@@ -34,10 +34,10 @@ from shared.wire.schemas import LLM_MODES, Readiness
 # How often a request is cancelled for a decision, the quiet time that it waits for, and how long it waits at most. Each
 # request evicts the other kind's prefix from the cache. In a mission, decisions come seconds apart.
 _MOST_CANCELLATIONS = 3
-_SILENCE_S = 0.5
+SILENCE_S = 0.5
 _PATIENCE_S = 10.0
 log = logging.getLogger(__name__)
-_RETRY_S = 5.0
+RETRY_S = 5.0
 # Message to a call that is cancelled because an earlier call was answered, which is no failure of this server.
 EARLIER_CALL_ANSWERED = "another answered"
 
@@ -80,12 +80,12 @@ class DecisionPriority:
         return await ask()
 
     async def _await_silence(self) -> None:
-        """Wait until no decision has been requested for ``_SILENCE_S``, at most ``_PATIENCE_S``."""
+        """Wait until no decision has been requested for ``SILENCE_S``, at most ``_PATIENCE_S``."""
         started = time.monotonic()
         while (now := time.monotonic()) < started + _PATIENCE_S:
-            if not self._decisions and now - max(started, self._decided_at) >= _SILENCE_S:
+            if not self._decisions and now - max(started, self._decided_at) >= SILENCE_S:
                 return
-            await asyncio.sleep(min(0.1, _SILENCE_S))
+            await asyncio.sleep(min(0.1, SILENCE_S))
 
 
 @dataclass(slots=True)
@@ -298,11 +298,11 @@ class LlmServer:
                 return
             except (NoDecision, TimeoutError) as error:
                 self.status = ServerStatus("unavailable", str(error) or f"no answer in {PROBE_TIMEOUT_S:g} s")
-                log.warning("LLM not ready, next try in %g s: %s", _RETRY_S, self.status.detail)
+                log.warning("LLM not ready, next try in %g s: %s", RETRY_S, self.status.detail)
             except Exception as error:
                 self.status = ServerStatus("unavailable", f"{type(error).__name__}: see the log")
-                log.exception("LLM not ready, next try in %g s", _RETRY_S)
-            await asyncio.sleep(_RETRY_S)
+                log.exception("LLM not ready, next try in %g s", RETRY_S)
+            await asyncio.sleep(RETRY_S)
 
     async def _probe_again(self) -> None:
         """Probe a ready server whose answers cannot be used: it may have another model now."""

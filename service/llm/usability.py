@@ -9,13 +9,13 @@ from contextvars import Context
 from service.llm.answers import NoDecision
 
 _FAILURES = 3
-_PAUSE_S, _LONGEST_PAUSE_S = 5.0, 60.0
+PAUSE_S, LONGEST_PAUSE_S = 5.0, 60.0
 log = logging.getLogger(__name__)
 # Answers in a row that cannot be used. A small model errs now and then.
 _DEGRADED = 5
 _MOST_QUOTED = 200
 # Until a degraded server is probed.
-_FIRST_UNUSABLE_S, _LONGEST_UNUSABLE_S = 30.0, 480.0
+FIRST_UNUSABLE_S, _LONGEST_UNUSABLE_S = 30.0, 480.0
 
 
 class CircuitBreaker:
@@ -48,7 +48,7 @@ class CircuitBreaker:
     @property
     def pause_s(self) -> float:
         """Seconds from the opening to the next probe."""
-        return min(_LONGEST_PAUSE_S, _PAUSE_S * 2.0 ** min(self._openings - 1, 10))
+        return min(LONGEST_PAUSE_S, PAUSE_S * 2.0 ** min(self._openings - 1, 10))
 
 
 class SilenceCounter:
@@ -99,7 +99,7 @@ class Usability:
         self._unusable = 0
         # After a passed probe the first unusable answer degrades the server again.
         self._suspect = False
-        self._pause_s = _FIRST_UNUSABLE_S
+        self._pause_s = FIRST_UNUSABLE_S
         self._task: asyncio.Task[None] | None = None
         self.degraded: str | None = None
 
@@ -112,7 +112,7 @@ class Usability:
     def usable(self) -> None:
         """Count a decision's answer that passed every check."""
         self._suspect = False
-        self._pause_s = _FIRST_UNUSABLE_S
+        self._pause_s = FIRST_UNUSABLE_S
         self._restore()
 
     def unusable(self, why: NoDecision) -> None:

@@ -11,7 +11,7 @@ from shared.wire.missions import VisitDeadline
 # Most ended orders in memory.
 _MOST_ENDED = 100
 # Steps after which no outcome changes a count: more than a fleet's UAVs may be apart.
-_FINAL_AFTER = 128
+FINAL_AFTER = 128
 
 
 @dataclass(slots=True)
@@ -65,8 +65,8 @@ class VisitOrders:
             # A step with an earlier decision counts for the previous orders.
             self._change(guidance, step if step > self.last else self.last + 1)
         self.last = max(self.last, step)
-        if self.last - self._final > 2 * _FINAL_AFTER:
-            self._final = self.last - _FINAL_AFTER
+        if self.last - self._final > 2 * FINAL_AFTER:
+            self._final = self.last - FINAL_AFTER
             for order in self._orders():
                 order.close(self._final)
 

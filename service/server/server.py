@@ -30,10 +30,10 @@ _WARNING_S = 60.0
 # Bytes of request line and headers; a regular client's longest are an Idempotency-Key and a trace's state.
 _MOST_BYTES = 64 * 1024
 # Seconds to the end of a head, from the start of the connection or the first byte of a further request.
-_MOST_S = 30.0
+MOST_S = 30.0
 # The least bytes of an answer that a client has to read in this time: 0.5 KB a second, less than a timely decision
 # needs. A page's stream has its own, shorter limit.
-_TAKEN_BYTES, _TAKEN_S = 16 * 1024, 30.0
+TAKEN_BYTES, TAKEN_S = 16 * 1024, 30.0
 # The system's buffer for the answers of one connection, bytes; by itself it takes megabytes for a client that does not
 # read.
 _UNSENT_BYTES = 128 * 1024
@@ -108,7 +108,7 @@ class BoundedHttpProtocol(HttpToolsProtocol):
         # Writing is paused while any byte is unsent.
         transport.set_write_buffer_limits(high=0)
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNSENT_BYTES)
-        self._timer = self.loop.call_later(_MOST_S, transport.close)
+        self._timer = self.loop.call_later(MOST_S, transport.close)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._stop_timer()
@@ -137,7 +137,7 @@ class BoundedHttpProtocol(HttpToolsProtocol):
             self._stop_timer()
         elif self._timer is None:
             # uvicorn's own timer ends with the first byte of the next request.
-            self._timer = self.loop.call_later(_MOST_S, self.transport.close)
+            self._timer = self.loop.call_later(MOST_S, self.transport.close)
 
     def on_headers_complete(self) -> None:
         self._completed = True
@@ -179,11 +179,11 @@ class BoundedHttpProtocol(HttpToolsProtocol):
         super()._start_asgi_task(cycle, app)
 
     def _watch(self, unsent: int) -> None:
-        self._sending = self.loop.call_later(_TAKEN_S, self._check, unsent)
+        self._sending = self.loop.call_later(TAKEN_S, self._check, unsent)
 
     def _check(self, before: int) -> None:
         unsent = self.transport.get_write_buffer_size()
-        if before - unsent >= _TAKEN_BYTES:
+        if before - unsent >= TAKEN_BYTES:
             self._watch(unsent)
         else:
             log.warning("clients do not take their answers: their connections are closed")

@@ -23,8 +23,8 @@ from service.storage.store import cause
 log = logging.getLogger(__name__)
 
 # Changes in a transaction, and bytes of checkpoints: those of large networks have megabytes.
-_MOST_CHANGES, _MOST_BYTES = 1000, 16_000_000
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 5.0
+_MOST_CHANGES, MOST_BYTES = 1000, 16_000_000
+_FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 5.0
 # The longest wait of a change for others if no request waits for it.
 _LINGER_S = 0.25
 
@@ -160,7 +160,7 @@ class GroupCommit:
         for entry in islice(self._queue, _MOST_CHANGES):
             self._batch.append(entry)
             checkpoint_bytes += len(entry[1].state) if isinstance(entry[1], Checkpoint) else 0
-            if checkpoint_bytes > _MOST_BYTES:
+            if checkpoint_bytes > MOST_BYTES:
                 break
         self._started_at = time.perf_counter()
         try:
@@ -189,7 +189,7 @@ class GroupCommit:
         if self._failure is not None:
             self._state = _CommitState.PAUSING
             self._timer = self._loop.call_later(self._pause_s, self._begin, _CommitState.WRITING)
-            self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
+            self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
         elif not self._queue:
             self._state = _CommitState.IDLE
         elif any(not reached.done() for _, reached in self._requests):

@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 # Events between two checkpoints of a mission: replaying them takes a fraction of a second. A decision about many
 # sensors takes longer to replay, and counts for one more event every hundred sensors.
-_EVENTS = 512
+EVENTS = 512
 _SENSORS = 100
 # From this number of sensors on, packing a checkpoint takes up to a second.
 _LARGE = 1000
@@ -113,7 +113,7 @@ class Journal:
         """Record a new mission, and every event of it from now on."""
         self._commits.add(Made(mission.mission_id, mission.requested_spec, mission.spec, epoch))
         # Similar missions that start together must not all need a checkpoint at the same time.
-        self._record(MissionLog(mission, 0, crc32(mission.mission_id.encode()) % _EVENTS, epoch))
+        self._record(MissionLog(mission, 0, crc32(mission.mission_id.encode()) % EVENTS, epoch))
 
     def resume(self, mission: Mission, seq: int, replayed: Sequence[Event], epoch: int = 0) -> None:
         """Record every event of a restored mission from now on.
@@ -177,7 +177,7 @@ class Journal:
         if self.epoch(mission_id) == epoch:
             self.on_lost(mission_id)
 
-    def due(self, mission: Mission, least: int = _EVENTS) -> MissionLog | None:
+    def due(self, mission: Mission, least: int = EVENTS) -> MissionLog | None:
         """The log of a mission with at least this many events since its last checkpoint; resets the count."""
         mission_log = self._logs.get(mission.mission_id)
         if mission_log is None or mission_log.mission is not mission or mission_log.since_checkpoint < least:

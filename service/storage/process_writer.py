@@ -18,7 +18,7 @@ from service.storage.sqlite_process import LENGTH, identity
 log = logging.getLogger(__name__)
 
 # The longest wait for an idle process to exit.
-_EXIT_S = 1.0
+EXIT_S = 1.0
 _READ_BYTES = 65_536
 
 
@@ -88,7 +88,7 @@ class ProcessWriter:
         if self._process is not None:
             # The process ends when its socket is closed. If the disk hangs, it ends later and has the lock until then.
             with suppress(subprocess.TimeoutExpired):
-                message = self._process.communicate(timeout=_EXIT_S)[1].decode(errors="replace").strip()
+                message = self._process.communicate(timeout=EXIT_S)[1].decode(errors="replace").strip()
                 message = message.splitlines()[-1] if message else f"exit code {self._process.returncode}"
         self._socket = self._process = self._loop = None
         self._full = False

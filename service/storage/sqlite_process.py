@@ -28,8 +28,8 @@ LENGTH = struct.Struct("<I")
 BUSY_MS = 1000
 # WAL: readers and the writer do not wait for each other. FULL: a commit survives a power failure.
 PRAGMAS = ("journal_mode=WAL", "synchronous=FULL", f"busy_timeout={BUSY_MS}")
-# Looking at the log's times makes the next commit a quarter slower, because the file system must then write exact ones
-# (Linux 6.13, multigrain timestamps). So it is looked at after this pause, and in a busy store after this time.
+# A look at the log's times makes the next commit a quarter slower: the file system then writes exact times (multigrain
+# timestamps, since Linux 6.13). So the log is looked at after this pause, and in a busy store after this time.
 _PAUSE_MS, _LOOK_S = 3, 0.05
 
 

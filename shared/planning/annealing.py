@@ -41,7 +41,7 @@ _ANEW = 0.5
 # The value of a collected level of a queue that saves no loss, packets: enough to break ties.
 _PACKET = 1e-4
 # Changes of a run, at one temperature, and between two checks of the clock; the final temperature, packets.
-_CHANGES, _SAME_TEMPERATURE, _AT_ONCE, _COLD = 5000, 32, 1000, 0.01
+CHANGES, _SAME_TEMPERATURE, _AT_ONCE, _COLD = 5000, 32, 1000, 0.01
 
 
 @inlined
@@ -272,11 +272,11 @@ class Annealing:
         """
         current, new = self._start(start)
         least, best = float(current.cost.sum()), start.copy()
-        falls = (_COLD / hot) ** (1.0 / _CHANGES)
-        for first in range(0, _CHANGES, _AT_ONCE):
+        falls = (_COLD / hot) ** (1.0 / CHANGES)
+        for first in range(0, CHANGES, _AT_ONCE):
             if time.perf_counter() > until:
                 break
-            last, seed = min(first + _AT_ONCE, _CHANGES), _CHANGES * number + first
+            last, seed = min(first + _AT_ONCE, CHANGES), CHANGES * number + first
             least = _anneal(self._tables, current, new, best, least, first, last, hot, falls, seed)
         current, new = self._start(best)
         return Found(best, _settle(self._tables, current, new, best))

@@ -42,7 +42,7 @@ _NEGLIGIBLE = 0.003
 
 
 # By run of the search: from the better start (0) or the worse one, and its first temperature as a share of their loss.
-_RUNS = [(start, heat) for heat in (0.05, 0.15, 0.05) for start in (0, 1)]
+RUNS = [(start, heat) for heat in (0.05, 0.15, 0.05) for start in (0, 1)]
 # Packets: the least first temperature; the expected loss after the first run from which more runs are worth it; and the
 # better start's expected loss from which all runs start together.
 _LEAST_HEAT, _WORTH_RUNS, _WORTH_AT_ONCE = 0.02, 0.1, 1.0
@@ -114,11 +114,11 @@ class Draft:
         starts = sorted((last, greedy), key=_loss)
 
         def run(number: int) -> Found:
-            start, heat = _RUNS[number]
+            start, heat = RUNS[number]
             hot = max(heat * starts[0].expected_loss, _LEAST_HEAT)
             return annealing.search(starts[start].actions, hot, number, until)
 
-        best, left = starts[0], range(len(_RUNS))
+        best, left = starts[0], range(len(RUNS))
         if best.expected_loss < _WORTH_AT_ONCE:
             best, left = min(best, run(0), key=_loss), left[1:]
             if best.expected_loss < _WORTH_RUNS:

@@ -21,7 +21,7 @@ def briefly_planned() -> Iterator[None]:
     For a module: later tests of the same process, and their own processes, plan as the edge does.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("shared.planning.receding._RUNS", [(0, 0.05)])
+        patch.setattr("shared.planning.receding.RUNS", [(0, 0.05)])
         yield
 
 
@@ -42,8 +42,8 @@ def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 @pytest.fixture
 def left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """An LLM server whose circuit breaker opens stays left alone for longer than any test takes."""
-    monkeypatch.setattr("service.llm.usability._PAUSE_S", 3600.0)
-    monkeypatch.setattr("service.llm.usability._LONGEST_PAUSE_S", 3600.0)
+    monkeypatch.setattr("service.llm.usability.PAUSE_S", 3600.0)
+    monkeypatch.setattr("service.llm.usability.LONGEST_PAUSE_S", 3600.0)
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

@@ -20,7 +20,7 @@ def undrawn() -> Iterator[None]:
 @pytest.fixture
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     """The planner searches in one run, where its plans' quality is not the subject."""
-    monkeypatch.setattr("shared.planning.receding._RUNS", [(0, 0.05)])
+    monkeypatch.setattr("shared.planning.receding.RUNS", [(0, 0.05)])
 
 
 @pytest.fixture(autouse=True)

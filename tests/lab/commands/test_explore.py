@@ -77,7 +77,7 @@ def test_bad_use_is_one_clear_line(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("lab.commands.explore._READY_S", 0.0)
+    monkeypatch.setattr("lab.commands.explore.READY_S", 0.0)
     assert main(["--out", str(tmp_path / "r.gz"), *options]) == 2
     printed = capsys.readouterr().err
     assert message in printed

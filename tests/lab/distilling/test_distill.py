@@ -69,7 +69,7 @@ def rollouts(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def distilled(rollouts: Path, tmp_path_factory: pytest.TempPathFactory, loaded_once: None) -> Path:
     out = tmp_path_factory.mktemp("runs") / "adapter"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lab.distilling.distill._EVALUATED", 4)
+        patch.setattr("lab.distilling.distill.EVALUATED", 4)
         distill(Distill(rollouts=(rollouts,), out=out, steps=3, batch=4, rank=2), Console(quiet=True))
     return out
 
@@ -378,7 +378,7 @@ def answered(gguf: Path, adapter: Path | None, texts: list[str], times: int) -> 
 def test_an_interrupted_training_goes_on_to_the_same_weights(
     rollouts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lab.distilling.adapter_training._CHECKPOINT_STEPS", 2)
+    monkeypatch.setattr("lab.distilling.adapter_training.CHECKPOINT_STEPS", 2)
     args = Distill(rollouts=(rollouts,), out=tmp_path, steps=4, batch=2, rank=1)
     [found] = examples_of([rollouts], tmp_path)
     examples = found.training

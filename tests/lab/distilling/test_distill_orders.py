@@ -33,7 +33,7 @@ pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 def distilled(tmp_path_factory: pytest.TempPathFactory, loaded_once: None) -> Path:
     out = tmp_path_factory.mktemp("runs") / "orders"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lab.distilling.distill_orders._EVALUATED", 8)
+        patch.setattr("lab.distilling.distill_orders.EVALUATED", 8)
         distill_orders(DistillOrders(out=out, steps=3, batch=4, rank=2), Console(quiet=True))
     return out
 

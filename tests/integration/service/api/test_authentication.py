@@ -138,7 +138,7 @@ async def test_a_keys_requests_may_come_at_once_and_then_evenly(tmp_path: Path) 
 
 
 def test_a_lost_file_of_keys_is_seen(edge: Edge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.api.api_keys._STALE_S", 0.0)
+    monkeypatch.setattr("service.api.api_keys.STALE_S", 0.0)
     path = tmp_path / "keys.json"
     key = bearer(made(path, fleet=("decide",))["fleet"])
     client, content = edge(keys=path), path.read_bytes()

@@ -223,9 +223,9 @@ def test_no_spelling_of_a_name_passes(flown: Any, keys: Any, name: str) -> None:
 def test_a_stream_ends_when_its_key_is_bound_elsewhere(
     edge: Edge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.api.api_keys._STALE_S", 0.0)
-    monkeypatch.setattr("service.api.live_routes._KEY_CHECK_S", 0.0)
-    monkeypatch.setattr("service.live.broadcaster._HEARTBEAT_S", 0.05)
+    monkeypatch.setattr("service.api.api_keys.STALE_S", 0.0)
+    monkeypatch.setattr("service.api.live_routes.KEY_CHECK_S", 0.0)
+    monkeypatch.setattr("service.live.broadcaster.HEARTBEAT_S", 0.05)
     file, path = KeyFile(), tmp_path / "keys.json"
     key = bearer(file.add("fleet", frozenset({"admin"}), 100_000))
     file.write(path)

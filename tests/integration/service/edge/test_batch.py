@@ -170,7 +170,7 @@ def test_a_server_that_hangs_keeps_no_fleet_waiting(
     monkeypatch.setattr("service.deciding.stopwatch.time", clock)
     monkeypatch.setattr(LlmQueries, "ask_for_fleet", timed)
     # The rest of the deadline passes in real time, and eight evaluations are slow on a busy machine.
-    monkeypatch.setattr("service.deciding.rollout_evaluator._FUTURES", 1)
+    monkeypatch.setattr("service.deciding.rollout_evaluator.FUTURES", 1)
     chorus = Chorus(hangs_on="UAV")
     with serving(chorus.app) as url, chorus.gate:
         client = edge(mode="guided", llm_url=f"{url}/v1")
@@ -217,7 +217,7 @@ def test_a_batch_that_was_sent_again_meanwhile_does_not_count(edge: Edge, report
 def test_a_server_that_hangs_on_the_probe_is_asked_one_by_one(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.llm.probing._TOGETHER_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("service.llm.probing.TOGETHER_TIMEOUT_S", 0.1)
     chorus = Chorus(hangs_on="Say hello.")
     with serving(chorus.app) as url, chorus.gate:
         client = edge(mode="guided", llm_url=f"{url}/v1")

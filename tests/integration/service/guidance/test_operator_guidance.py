@@ -342,7 +342,7 @@ def test_an_overdue_sensor_out_of_reach_is_not_waited_for() -> None:
 
 
 async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.llm.server._SILENCE_S", 0.0)
+    monkeypatch.setattr("service.llm.server.SILENCE_S", 0.0)
     upstream = LlmServer(Settings(mode="llm"), WarmUp("", "", None))
     running: list[str] = []
     finished: list[str] = []
@@ -367,7 +367,7 @@ async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(mo
 
 
 async def test_what_is_asked_beside_goes_through_at_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.llm.server._SILENCE_S", 0.0)
+    monkeypatch.setattr("service.llm.server.SILENCE_S", 0.0)
     upstream = LlmServer(Settings(mode="llm"), WarmUp("", "", None))
     given_up = asked = decided = 0
 

@@ -236,9 +236,9 @@ def test_the_page_is_open_and_what_it_shows_needs_a_key(
     edge: Edge, report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A key is looked at again at each event, and one comes soon.
-    monkeypatch.setattr("service.live.broadcaster._HEARTBEAT_S", 0.05)
-    monkeypatch.setattr("service.api.live_routes._KEY_CHECK_S", 0.0)
-    monkeypatch.setattr("service.api.api_keys._STALE_S", 0.0)
+    monkeypatch.setattr("service.live.broadcaster.HEARTBEAT_S", 0.05)
+    monkeypatch.setattr("service.api.live_routes.KEY_CHECK_S", 0.0)
+    monkeypatch.setattr("service.api.api_keys.STALE_S", 0.0)
     path = tmp_path / "keys.json"
     with editing(path) as known:
         admin = known.add("fleet", frozenset(("decide", "admin")), 6000)

@@ -40,7 +40,7 @@ def test_three_failures_open_it_and_one_more_for_longer_until_an_answer_closes_i
 def test_a_server_that_hangs_keeps_three_waiting_and_is_asked_again_when_it_is_well(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.llm.usability._PAUSE_S", 0.01)
+    monkeypatch.setattr("service.llm.usability.PAUSE_S", 0.01)
     # However short a wait is, it is longer than half of a deadline.
     monkeypatch.setattr("service.llm.server.time", Striding(100.0))
     hangs, probes = True, Gate(opened=True)
@@ -169,7 +169,7 @@ def test_who_stood_in_a_queue_does_not_open_it(edge: Edge, report: Report, monke
 def test_a_note_sent_while_it_is_open_is_compiled_when_it_is_well(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.llm.usability._PAUSE_S", 0.01)
+    monkeypatch.setattr("service.llm.usability.PAUSE_S", 0.01)
     probes = Gate(opened=True)
 
     class Ill(StubLlm):

@@ -29,7 +29,7 @@ NAMES, SLOTS = ("first", "second"), 2
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     for limit in ("connection.PROBE_TIMEOUT_S", "probing._TOGETHER_TIMEOUT_S", "calibration._TIMEOUT_S"):
         monkeypatch.setattr(f"service.llm.{limit}", PATIENCE_S)
-    monkeypatch.setattr("service.llm.server._RETRY_S", 0.2)
+    monkeypatch.setattr("service.llm.server.RETRY_S", 0.2)
 
 
 class Missions:

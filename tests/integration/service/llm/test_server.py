@@ -213,7 +213,7 @@ def test_a_server_that_is_still_loading_is_probed_again(
     edge: Edge, monkeypatch: pytest.MonkeyPatch, status: int
 ) -> None:
     """A refusal for want of time says nothing about what the server obeys."""
-    monkeypatch.setattr("service.llm.server._RETRY_S", 0.05)
+    monkeypatch.setattr("service.llm.server.RETRY_S", 0.05)
     model = Model("grammar")
     complete, early = model.complete, [status] * 3
 
@@ -247,7 +247,7 @@ def test_a_server_that_lists_its_model_only_once_it_has_loaded_it_is_named(edge:
 def test_a_server_that_goes_away_is_told_and_found_again(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.llm.server._RETRY_S", 0.05)
+    monkeypatch.setattr("service.llm.server.RETRY_S", 0.05)
     with serving(Model("grammar").app) as url:
         client = edge(mode="llm", llm_url=f"{url}/v1")
         wait_for(client, "ready")
@@ -304,7 +304,7 @@ def test_a_timed_out_call_is_hung_up(edge: Edge, report: Report) -> None:
 
 
 def test_an_upstream_that_is_down_is_tried_again(edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.llm.server._RETRY_S", 0.1)
+    monkeypatch.setattr("service.llm.server.RETRY_S", 0.1)
     with serving(Model("grammar").app) as url:
         port = int(url.rsplit(":", 1)[1])
     client = edge(mode="llm", llm_url=f"{url}/v1")

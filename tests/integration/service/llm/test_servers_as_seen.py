@@ -276,7 +276,7 @@ def test_a_connection_that_was_closed_while_idle_costs_no_decision(edge: Edge, r
 
 
 def test_a_renamed_model_is_asked_for_again(edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.llm.usability._FIRST_UNUSABLE_S", 0.1)
+    monkeypatch.setattr("service.llm.usability.FIRST_UNUSABLE_S", 0.1)
     name = "old"
 
     def knows_one_model(body: Body) -> Response | str:

@@ -112,7 +112,7 @@ def test_a_body_in_many_small_chunks_is_no_head() -> None:
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nho"])
 def test_who_does_not_end_its_head_is_hung_up(monkeypatch: pytest.MonkeyPatch, sent: bytes) -> None:
-    monkeypatch.setattr(server, "_MOST_S", 0.1)
+    monkeypatch.setattr(server, "MOST_S", 0.1)
     with serving(counting) as url:
         assert hung_up(address_of(url), sent)
 
@@ -122,7 +122,7 @@ def test_nor_does_it_help_to_have_asked_before(monkeypatch: pytest.MonkeyPatch, 
     with serving(counting) as url, socket.create_connection(address_of(url), timeout=PATIENCE_S) as connection:
         connection.sendall(b"GET / HTTP/1.1\r\nhost: localhost\r\n\r\n")
         assert connection.recv(65536).startswith(b"HTTP/1.1 200 ")
-        monkeypatch.setattr(server, "_MOST_S", 0.1)
+        monkeypatch.setattr(server, "MOST_S", 0.1)
         # Whatever comes ends uvicorn's own waiting.
         connection.sendall(sent)
         while connection.recv(65536):
@@ -141,7 +141,7 @@ def test_who_has_asked_may_wait_longer_than_that(monkeypatch: pytest.MonkeyPatch
     with serving(patient) as url, ThreadPoolExecutor() as pool:
         waiting = pool.submit(httpx.get, url, timeout=PATIENCE_S)
         assert asked.wait(PATIENCE_S)
-        monkeypatch.setattr(server, "_MOST_S", 0.1)
+        monkeypatch.setattr(server, "MOST_S", 0.1)
         # Who came later and said nothing was hung up before.
         assert hung_up(address_of(url), b"")
         may.set()

@@ -138,7 +138,7 @@ def test_who_does_not_read_is_hung_up(
     sent: bytes,
     then: Callable[[socket.socket], object],
 ) -> None:
-    monkeypatch.setattr(server, "_TAKEN_S", 0.5)
+    monkeypatch.setattr(server, "TAKEN_S", 0.5)
     app = App(tmp_path)
     with serving(app) as url, closing(connected(url, sent)) as client:
         until(lambda: connections.stuck)
@@ -160,7 +160,7 @@ def test_the_system_keeps_no_megabyte_for_who_does_not_read(tmp_path: Path, conn
 def test_who_reads_a_byte_at_a_time_is_hung_up(
     tmp_path: Path, connections: Connections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server, "_TAKEN_S", 0.1)
+    monkeypatch.setattr(server, "TAKEN_S", 0.1)
     with serving(App(tmp_path)) as url, closing(connected(url, get("/large"))) as client:
         until(lambda: client.recv(1) and connections.lost)
 
@@ -170,8 +170,8 @@ def test_who_reads_slowly_gets_the_whole_answer(
     tmp_path: Path, connections: Connections, monkeypatch: pytest.MonkeyPatch, path: str
 ) -> None:
     # The time is over at once, again and again, and what was taken meanwhile is enough.
-    monkeypatch.setattr(server, "_TAKEN_S", 0.001)
-    monkeypatch.setattr(server, "_TAKEN_BYTES", 0)
+    monkeypatch.setattr(server, "TAKEN_S", 0.001)
+    monkeypatch.setattr(server, "TAKEN_BYTES", 0)
     with serving(App(tmp_path)) as url, closing(connected(url, get(path, "connection: close"))) as client:
         until(lambda: connections.stuck)
         answer = b"".join(iter(lambda: client.recv(65536), b""))

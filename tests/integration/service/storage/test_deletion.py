@@ -62,7 +62,7 @@ def test_a_mission_deleted_twice_is_gone_when_that_is_said(
         (writer,) = writers(os.getpid())
         writer.suspend()
         with monkeypatch.context() as impatient:
-            impatient.setattr("service.edge.engine._STORE_S", 0.1)
+            impatient.setattr("service.edge.engine.STORE_S", 0.1)
             assert [client.delete("/missions/test").status_code for _ in range(2)] == [503, 503]
         writer.resume()
         assert client.delete("/missions/test").status_code == 404

@@ -31,7 +31,7 @@ Report = Callable[..., Body]
 def test_what_is_on_disk_is_the_mission_with_and_without_checkpoints(
     tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch, mode: str, events: int
 ) -> None:
-    monkeypatch.setattr(journal, "_EVENTS", events)
+    monkeypatch.setattr(journal, "EVENTS", events)
     monkeypatch.setattr("service.storage.journal.Journal.due.__defaults__", (events,))
     settings = Settings(mode=mode, llm_gguf=Path("none"))
     with running(tmp_path / "m.db", mode=mode, llm_gguf="none", planner_ms=20) as (client, engine):
@@ -145,7 +145,7 @@ def test_many_missions_are_woken_when_they_are_asked_about(tmp_path: Path, repor
 def test_while_the_store_is_locked_decisions_go_on_and_feedback_is_refused(
     tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(group_commit, "_LONGEST_PAUSE_S", 0.25)
+    monkeypatch.setattr(group_commit, "LONGEST_PAUSE_S", 0.25)
     with running(tmp_path / "m.db") as (client, engine):
         owed = fly(client, report, range(3))
         other = locked(tmp_path / "m.db")
@@ -244,7 +244,7 @@ def test_missions_that_begin_together_are_not_checkpointed_all_at_once(tmp_path:
             assert client.put(f"/missions/fleet{n}", json={"mode": "value"}).status_code == 200
         assert isinstance(engine.journal, journal.Journal)
         least = {
-            next(n for n in range(journal._EVENTS, -1, -1) if engine.journal.due(mission, n) is not None)
+            next(n for n in range(journal.EVENTS, -1, -1) if engine.journal.due(mission, n) is not None)
             for mission in engine.missions.loaded
         }
     assert len(least) > 10

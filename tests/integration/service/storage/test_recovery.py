@@ -126,7 +126,7 @@ async def test_a_journal_that_is_closed_writes_no_more_and_starts_nothing(tmp_pa
 
 
 async def test_large_checkpoints_are_written_a_few_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.storage.group_commit._MOST_BYTES", 50_000)
+    monkeypatch.setattr("service.storage.group_commit.MOST_BYTES", 50_000)
     store = MoodyStore(str(tmp_path / "m.db"))
     journal = Journal(store, Metrics())
     most: list[int] = []
@@ -245,8 +245,8 @@ def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
     tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     # Of a batch's three outcomes, which come at once, two can wait.
-    monkeypatch.setattr(feedback, "_MAX_TASKS", 2)
-    monkeypatch.setattr(feedback, "_WARNING_S", 3600.0)
+    monkeypatch.setattr(feedback, "MAX_TASKS", 2)
+    monkeypatch.setattr(feedback, "WARNING_S", 3600.0)
     with running(tmp_path / "m.db") as (client, engine):
         owed: dict[int, str] = {}
         for step in range(6):

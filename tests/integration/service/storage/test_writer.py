@@ -45,7 +45,7 @@ def test_a_writer_that_is_killed_is_followed_by_another_and_nothing_is_lost(
         # What it was sent it has not written.
         first.suspend()
         with monkeypatch.context() as impatient:
-            impatient.setattr("service.edge.engine._STORE_S", 0.1)
+            impatient.setattr("service.edge.engine.STORE_S", 0.1)
             told = client.post("/decide", json=report(step=2, outcome=owed[0]))
         assert (told.status_code, told.json()["stored"]) == (200, False)
         first.kill()

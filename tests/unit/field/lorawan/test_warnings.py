@@ -56,7 +56,7 @@ def test_what_cannot_be_used_is_logged_once_a_device_and_reason(
 def test_made_up_devices_do_not_flood_the_log(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("field.lorawan.pending_readings._MOST_WARNINGS", 5)
+    monkeypatch.setattr("field.lorawan.pending_readings.MOST_WARNINGS", 5)
     pending = reading_buffer()
     for number in range(10, 30):
         assert take(pending, chirpstack_up(device=number)) == "unknown_device"

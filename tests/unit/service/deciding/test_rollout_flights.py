@@ -148,7 +148,7 @@ ORDERS = Guidance(
 def test_it_flies_as_plain_python_does(
     guidance: Guidance, uncertain: bool, planned: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rollout_evaluator, "_FUTURES", FUTURES)
+    monkeypatch.setattr(rollout_evaluator, "FUTURES", FUTURES)
     for seed in range(2):
         state = state_of(seed, guidance, uncertain=uncertain, planned=planned)
         found, futures = evaluate(state, CANDIDATES), SampledFutures.of(state, FUTURES)

@@ -123,7 +123,7 @@ def test_a_prompt_is_read_again_until_one_is_answered_that_was_sent_after_the_ba
 async def test_a_rewriting_that_begins_again_counts_as_another_bare_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.llm.server._SILENCE_S", 0.0)
+    monkeypatch.setattr("service.llm.server.SILENCE_S", 0.0)
     settings = Settings(mode="llm", llm_adapter=str(tmp_path / "adapter.gguf"))
     warm = warm_up(settings)
     sent: list[dict[str, Any]] = []

@@ -33,7 +33,7 @@ async def test_five_unusable_answers_in_a_row_degrade_a_server_and_a_usable_one_
 
 
 async def test_after_a_passed_probe_the_first_unusable_answer_degrades_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.llm.usability._FIRST_UNUSABLE_S", 0.0)
+    monkeypatch.setattr("service.llm.usability.FIRST_UNUSABLE_S", 0.0)
     probes = 0
 
     async def probe() -> None:

@@ -64,7 +64,7 @@ def test_new_orders_end_the_ones_before_at_the_next_step() -> None:
 
 
 def test_a_long_mission_forgets_visits_and_no_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(visit_orders, "_FINAL_AFTER", 5)
+    monkeypatch.setattr(visit_orders, "FINAL_AFTER", 5)
     rng, wish = np.random.default_rng(0), orders(s0=1, s1=4, s2=12)
     bounded, visited = VisitOrders(), {sensor: set[int]() for sensor in range(3)}
     for step in range(200):

@@ -236,7 +236,7 @@ def test_without_time_the_velocities_stay_and_the_plan_is_no_worse() -> None:
 
 
 def test_each_run_draws_other_changes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shared.planning.annealing._CHANGES", 20)
+    monkeypatch.setattr("shared.planning.annealing.CHANGES", 20)
     whole = random_problem(0, uavs=3)
     start = random_plan(whole, 0)
     run = Annealing(whole)

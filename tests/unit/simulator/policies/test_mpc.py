@@ -82,7 +82,7 @@ def test_with_nothing_in_reach_it_still_answers() -> None:
 
 
 def test_without_a_search_it_still_loses_less_than_eof(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shared.planning.annealing._CHANGES", 1)
+    monkeypatch.setattr("shared.planning.annealing.CHANGES", 1)
     stress = SCENARIOS["stress"].model_copy(update={"steps": 12})
     longest = sum(t.lost_packets for t in rollout(PipelineWorld(stress), policy_named("longest_queue"), 101))
     assert sum(lost for lost, _ in flown(stress, 101)) < longest
