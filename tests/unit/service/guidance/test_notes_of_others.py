@@ -19,6 +19,9 @@ from tests.unit.service.guidance.test_note_phrases import phrased
         ("H2S at sensor 2, see it every minute and a half", "gas at sensor 2, see it every 1.5 minutes"),
         ("all three drones below 9 m/s, we need one reading", "all drones below 9 m/s, we need a reading"),
         ("Avoid 5 and 7 m/s, these two speeds shake", "Avoid 5 and 7 m/s, these speeds shake"),
+        ("Count it a fifth as much as sens 4", "Count it 0.200 times as much as sensor 4"),
+        ("The 75 mbar line is dug up, job no. 5591", "The pipe line is dug up, ticket"),
+        ("Visit sensor 4 above 5 bar", "Visit sensor 4 above 5 bar"),
         ("Twenty steps may pass between two calls on sensor 6", "twenty steps may pass between calls on sensor 6"),
     ],
 )
