@@ -144,12 +144,14 @@ def heuristics() -> Iterator[tuple[str, Policy]]:
         yield f"{name}_fast", AtFullSpeed(name)
 
 
-def flown(url: str, site: Site, seed: int) -> dict[str, int]:
+def flown(url: str, site: Site, seed: int, scale: float) -> dict[str, int]:
     """Packets lost in one world, by scheme."""
+    # The edge would take a second flight of one mission for repeated requests.
+    mission_id = f"trace-{scale:g}-{seed}"
     with EdgeClient(url, timeout_s=60.0) as client:
-        pilot = EdgePilot(client, f"trace-{seed}", site.scenario, seed)
+        pilot = EdgePilot(client, mission_id, site.scenario, seed)
         pilot.spec = pilot.spec.model_copy(update={"mode": "policy"})
-        client.put_mission(f"trace-{seed}", pilot.spec)
+        client.put_mission(mission_id, pilot.spec)
         policy = fly(site, pilot, seed).tally
     on_board = {"mpc": policy_named("mpc"), "mpc_formula": FormulaPlanner(), **dict(heuristics())}
     tallies = {name: rollout(site.world(), scheme, seed) for name, scheme in on_board.items()}
@@ -176,7 +178,7 @@ def main(args: Traced) -> int:
         for scale in args.scales:
             sites = [replace(Site(scenario), gains=drawn_trace(scenario, seed, scale)) for seed in seeds]
             worlds = track(zip(sites, seeds, strict=True), f"Links x {scale}", total=len(seeds), console=console)
-            lost = [flown(edge.url, site, seed) for site, seed in worlds]
+            lost = [flown(edge.url, site, seed, scale) for site, seed in worlds]
             found.append({"scale": scale, **_losses(console, lost), "ahead": _ahead(console, sites, list(seeds))})
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps({"seeds": list(seeds), "goals": [GOAL, GOAL_AHEAD], "worlds": found}, indent=2))

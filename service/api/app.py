@@ -11,8 +11,8 @@ from fastapi import FastAPI
 from service.api import live_routes, problem_details
 from service.api.api_keys import ApiKeys
 from service.api.authentication import KeyAuthentication, KnownHosts
-from service.api.load_limits import RequestLimits
 from service.api.openapi import schema_of
+from service.api.request_limits import RequestLimits
 from service.api.routes import decisions, router
 from service.config.settings import Settings
 from service.edge.compilation import load_for_event_loop

@@ -12,8 +12,8 @@ from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
 from service.api.api_keys import MOST_KEYS, ApiKey, ApiKeys, Scope
-from service.api.load_limits import READING
 from service.api.problem_details import problem_response, refusal_of
+from service.api.request_limits import READING
 from service.config.settings import Settings
 from service.errors import NotFound
 from shared.kit.bounded import BoundedDict

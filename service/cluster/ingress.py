@@ -16,8 +16,8 @@ from starlette.routing import Mount, Route
 from starlette.types import Receive, Scope, Send
 
 from service.api.authentication import KnownHosts
-from service.api.load_limits import RequestLimits
 from service.api.problem_details import problem_response
+from service.api.request_limits import RequestLimits
 from service.cluster.exchange import Answer, Exchanged, OwnersGone, merged_metrics, merged_missions, merged_readiness
 from service.config.settings import Settings
 from service.server.middleware import SecurityHeaders

@@ -10,10 +10,10 @@ from contextlib import suppress
 
 import msgpack
 
-from service.storage import sqlite_process
+from service.storage import sqlite_writer
 from service.storage.operations import Change, Done, WriteFailed
 from service.storage.rows import PACK_BYTES, Statements
-from service.storage.sqlite_process import LENGTH, identity
+from service.storage.sqlite_writer import LENGTH, identity
 
 log = logging.getLogger(__name__)
 
@@ -113,7 +113,7 @@ class ProcessWriter:
             try:
                 self._process = subprocess.Popen(
                     # -P keeps the script's folder out of its path: some modules there have names of standard ones.
-                    [sys.executable, "-P", sqlite_process.__file__, str(theirs.fileno()), *arguments],
+                    [sys.executable, "-P", sqlite_writer.__file__, str(theirs.fileno()), *arguments],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     # With the edge's own stderr, a reader of the edge's log would wait for a killed edge's last commit.

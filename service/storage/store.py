@@ -18,7 +18,7 @@ from service.storage.locks import FileLock, StoreUnusable
 from service.storage.operations import Writer
 from service.storage.process_writer import ProcessWriter
 from service.storage.rows import SCHEMA, Statements, checkpoints, decode, journal, missions, unpack
-from service.storage.sqlite_process import BUSY_MS, PRAGMAS
+from service.storage.sqlite_writer import BUSY_MS, PRAGMAS
 from service.storage.thread_writer import ThreadWriter
 from shared.wire.schemas import MissionSpec
 

@@ -109,7 +109,7 @@ def kept(client: httpx.Client, body: Body) -> Body:
 def writers(pid: int) -> list[psutil.Process]:
     """The processes that write stores for this one."""
     children = psutil.Process(pid).children()
-    return [child for child in children if any("sqlite_process" in word for word in child.cmdline())]
+    return [child for child in children if any("sqlite_writer" in word for word in child.cmdline())]
 
 
 async def written(writer: Writer, changes: Sequence[Change]) -> None:

@@ -13,7 +13,7 @@ import msgpack
 from service.storage.locks import FileLock
 from service.storage.operations import Change, Done, WriteFailed
 from service.storage.rows import Statements
-from service.storage.sqlite_process import Database
+from service.storage.sqlite_writer import Database
 from service.storage.store import Store
 
 

@@ -16,7 +16,7 @@ import pytest
 from starlette.responses import FileResponse, PlainTextResponse, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from service.api.load_limits import RequestLimits
+from service.api.request_limits import RequestLimits
 from service.server import server
 from service.server.server import BoundedHttpProtocol
 from tests.support.running import serving

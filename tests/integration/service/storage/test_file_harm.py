@@ -19,7 +19,7 @@ from service.mission.events import GuidanceChanged
 from service.mission.resolved_spec import ResolvedSpec
 from service.storage.locks import StoreUnusable
 from service.storage.operations import Change, Entry, Made
-from service.storage.sqlite_process import Database, identity
+from service.storage.sqlite_writer import Database, identity
 from service.storage.store import Store, cause
 from shared.wire.schemas import MissionSpec
 from tests.support.stored_missions import fly, running, writers, written

@@ -129,7 +129,7 @@ async def test_a_writer_that_ends_again_and_again_is_told_with_what_it_said(
     store = Store(str(tmp_path / "m.db"))
     broken = tmp_path / "broken.py"
     broken.write_text("raise SystemExit('this disk is on fire')")
-    monkeypatch.setattr("service.storage.sqlite_process.__file__", str(broken))
+    monkeypatch.setattr("service.storage.sqlite_writer.__file__", str(broken))
     writer = store.writer()
     for _ in range(3):
         with pytest.raises(WriteFailed, match="this disk is on fire"):

@@ -89,7 +89,7 @@ def test_strangers_whose_bodies_never_come_keep_nobody_out(edge: Edge, report: R
 def test_a_body_that_does_not_come_gives_its_place_back(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.api.load_limits.BODY_S", 0.1)
+    monkeypatch.setattr("service.api.request_limits.BODY_S", 0.1)
     client = edge(max_requests=2)
     with ExitStack() as held:
         for waiting in [begun(held, client, "POST /decide") for _ in range(2)]:
@@ -98,7 +98,7 @@ def test_a_body_that_does_not_come_gives_its_place_back(
             assert head.startswith(b"HTTP/1.1 408 ")
             assert b"\r\ncontent-type: application/problem+json" in head
             assert json.loads(body)["errors"][0]["field"] == "body"
-        monkeypatch.setattr("service.api.load_limits.BODY_S", PATIENCE_S)
+        monkeypatch.setattr("service.api.request_limits.BODY_S", PATIENCE_S)
         assert client.post("/decide", json=report()).status_code == 200
 
 
@@ -106,7 +106,7 @@ def test_a_body_that_does_not_come_gives_its_place_back(
 def test_what_may_always_be_read_is_in_the_crowd_where_a_body_is_sent(
     edge: Edge, path: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.api.load_limits.BODY_S", PATIENCE_S)
+    monkeypatch.setattr("service.api.request_limits.BODY_S", PATIENCE_S)
     client = edge(max_requests=1)
     with ExitStack() as held:
         both = [begun(held, client, f"POST {path}") for _ in range(2)]
@@ -120,7 +120,7 @@ def test_what_may_always_be_read_is_in_the_crowd_where_a_body_is_sent(
 def test_bodies_that_arrive_slowly_take_nobodys_place(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.api.load_limits.BODY_S", PATIENCE_S)
+    monkeypatch.setattr("service.api.request_limits.BODY_S", PATIENCE_S)
     client = edge(max_requests=2)
     with ExitStack() as held:
         slow = [begun(held, client, "POST /decide") for _ in range(5)]
