@@ -22,6 +22,7 @@ from tests.unit.service.guidance.test_note_phrases import phrased
         ("Count it a fifth as much as sens 4", "Count it 0.200 times as much as sensor 4"),
         ("The 75 mbar line is dug up, job no. 5591", "The pipe line is dug up, ticket"),
         ("Visit sensor 4 above 5 bar", "Visit sensor 4 above 5 bar"),
+        ("We permit 8 m/s, case 4 and job 7", "We permit 8 m/s, case 4 and job 7"),
         ("Twenty steps may pass between two calls on sensor 6", "twenty steps may pass between calls on sensor 6"),
     ],
 )
