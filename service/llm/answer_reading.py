@@ -35,7 +35,7 @@ _UNCLOSED = re.compile(rf"\A\s*[<\[]{_TAG}", re.IGNORECASE)
 _CLOSING = re.compile(rf"[<\[]/{_TAG}", re.IGNORECASE)
 _FINAL = re.compile(r".*<\|channel\|>final[^<]*<\|message\|>", re.DOTALL)
 _SPECIAL = re.compile(r"(?:<[|\uff5c][^<>]{1,40}[|\uff5c]>|</s>|<end_of_turn>)\Z")
-# Nothing of the above is in it.
+# An answer that has none of these.
 _PLAIN = re.compile(r"[a-zA-Z0-9 .,:;+-]*")
 _LONGEST_SPECIAL, _FENCE = 44, "```"
 _WRAPPED = re.compile(r"""\A\s*(?:\*\*(.*)\*\*|"(.*)"|\\boxed\{(.*)\})\s*\Z""", re.DOTALL)

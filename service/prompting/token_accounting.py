@@ -21,7 +21,7 @@ class TokenCounter:
         self._encoding = encoding(cache_dir)
         # The static block and most lines recur with every decision. A new line differs from earlier ones in its digits
         # alone, and its tokens depend on the number of these: every number of up to three digits is one token.
-        self.count_repeated = alike = lru_cache(maxsize=4096)(self.count)
+        self.count_repeated, alike = (lru_cache(maxsize=most)(self.count) for most in (256, 4096))
         self.count_line = lru_cache(maxsize=4096)(lambda line: alike(line.translate(_SAME_DIGITS)))
 
     def count(self, text: str) -> int:

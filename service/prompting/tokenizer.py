@@ -57,7 +57,7 @@ def encoding(cache_dir: Path) -> tiktoken.Encoding:
         with suppress(OSError):
             _write(packed, hashlib.sha256(content).digest() + content)
     made = tiktoken.Encoding(**parts)
-    # Counting needs only the copy that its compiled part has made, and this one takes 22 MB.
+    # Counting needs only the copy that its compiled part has made, and this one takes 27 MB.
     parts["mergeable_ranks"].clear()
     return made
 

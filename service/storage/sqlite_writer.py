@@ -90,7 +90,8 @@ class Database:
     """A connection that opens at its first transaction, and again after each failure.
 
     A commit to a deleted file would be lost when the edge ends. So a commit fails if the file, its lock file or its
-    write-ahead log was deleted, replaced or given another name, or if another program has written any of them.
+    write-ahead log was deleted, replaced or given another name, or if another program has written any of them. Of a
+    busy store the log is looked at every 50 ms only.
 
     Args:
         path: of the SQLite file, which must exist.
