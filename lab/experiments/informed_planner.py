@@ -8,12 +8,23 @@ import numpy as np
 
 from lab.exploration.wind import course
 from shared.planning.receding import Draft
+from shared.world.channel import IntArray
 from simulator.bound.clairvoyant_bound import true_links
 from simulator.flying.pilots import LocalPilot, PilotChoice
 from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import Observation
+
+
+def true_links_of_plan(world: PipelineWorld, draft: Draft) -> list[IntArray]:
+    """By UAV of a plan the packets of its true links, ``(1 or H, C, n + 1)``, as a plan's problem has them."""
+    horizon = draft.problem.horizon
+    ahead = course(world, horizon * world.scenario.max_velocity + 1)[:, None]
+    # Past the scenario's last step the world has no links, and no decisions either.
+    links = true_links(world, len(world.tally) + horizon, ahead)
+    nowhere = ((0, 0), (0, 0), (0, 1))
+    return [np.pad(links[index][:, :, draft.kept], nowhere) for index in draft.uavs]
 
 
 class InformedPlanner(RecedingHorizonPolicy):
@@ -34,12 +45,7 @@ class InformedPlanner(RecedingHorizonPolicy):
         draft = super().draft(uav, taken)
         if draft is None or not self._world.truth.differs:
             return draft
-        world, horizon = self._world, draft.problem.horizon
-        ahead = course(world, horizon * world.scenario.max_velocity + 1)[:, None]
-        # Past the scenario's last step the world has no links, and no decisions either.
-        links = true_links(world, len(world.tally) + horizon, ahead)
-        nowhere = ((0, 0), (0, 0), (0, 1))
-        told = [np.pad(links[index][:, :, draft.kept], nowhere) for index in draft.uavs]
+        told = true_links_of_plan(self._world, draft)
         return replace(draft, problem=replace(draft.problem, links=told, chances=None))
 
 
