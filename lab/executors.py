@@ -54,14 +54,15 @@ def ordered_map(workers: int, ray: str | None) -> Iterator[OrderedMap]:
         yield map
         return
     with executor(workers, ray) as pool:
-        yield partial(_in_order, pool)
+        yield partial(in_order, pool)
 
 
-def _in_order(pool: Executor, function: Callable[[A], T], items: Iterable[A], /) -> Iterator[T]:
+def in_order(pool: Executor, function: Callable[[A], T], items: Iterable[A], /, *, ahead: int = _AHEAD) -> Iterator[T]:
+    """The results in the items' order; at most ``ahead`` items are read before their results are."""
     waiting = deque[Future[T]]()
     for item in items:
         waiting.append(pool.submit(function, item))
-        if len(waiting) == _AHEAD:
+        if len(waiting) == ahead:
             yield waiting.popleft().result()
     while waiting:
         yield waiting.popleft().result()
@@ -98,13 +99,16 @@ class RayExecutor(Executor):
     """Tasks on the workers of the Ray that this process is connected to, each with a core of its own.
 
     A task whose worker dies is run again, by another worker; a task that raises is not.
+
+    Args:
+        release: the version of this package that the workers must have; ``None``: that of this machine.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, release: str | None = None) -> None:
         import ray
 
         self._apply: Any = ray.remote(num_cpus=1, max_retries=_RETRIES)(_apply)
-        self._release = version("aic-vds")
+        self._release = release or version("aic-vds")
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """The future of a call, whose exception is the one that the function raised."""

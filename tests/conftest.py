@@ -19,7 +19,6 @@ import httpx
 import hypothesis
 import pytest
 import torch
-from httpx._config import create_ssl_context
 
 from service.api.app import create_app
 from service.config.settings import Settings
@@ -78,18 +77,8 @@ def vocabulary() -> Iterator[None]:
 @pytest.fixture(autouse=True, scope="session")
 def certificates() -> Iterator[None]:
     """One SSL context for all HTTP clients of this process: to read the certificates takes more than most requests."""
-    made: dict[object, ssl.SSLContext] = {}
-
-    def context(verify: Any = True, cert: Any = None, trust_env: bool = True) -> ssl.SSLContext:
-        key = verify, cert, trust_env, os.environ.get("SSL_CERT_FILE"), os.environ.get("SSL_CERT_DIR")
-        if key not in made:
-            made[key] = create_ssl_context(verify, cert, trust_env)
-        return made[key]
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("httpx._transports.default.create_ssl_context", context)
-        # The edge's own client of LLM servers asks for one too.
-        patch.setattr("httpx.create_ssl_context", context)
+        patch.setattr(ssl, "create_default_context", cache(ssl.create_default_context))
         yield
 
 

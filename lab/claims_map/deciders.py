@@ -79,7 +79,7 @@ class EdgeFleet:
             sample = mission.apply(Outcome(decision_id=decision_id, cost=cost, failed=failed))
             if sample is not None and self._learns:
                 learned.append((sample, cost))
-        self._observe(request)
+        self.observe(request)
         self.state = state = AttendedState.of(mission, request, request.step)
         by_value = self._decider.by == "value" and state.rows
         action = state.best_by_value() if by_value else look_ahead_among(state)
@@ -94,7 +94,7 @@ class EdgeFleet:
             mission.learn(sample, cost)
         return action
 
-    def _observe(self, request: DecideRequest) -> None:
+    def observe(self, request: DecideRequest) -> None:
         """As ``Mission.observe``; a state from each UAV's own reports does not read the belief, so it stays unfed."""
         if self.mission.belief_source == "fleet":
             self.mission.observe(request, request.step)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _NAME = "aicvds-"
 _ROUTER = "ray.serve.experimental.consistent_hash_router.ConsistentHashRouter"
 # The average of concurrent requests for an edge above which another edge is started.
-_ONGOING = 8
+_SCALING = {"target_ongoing_requests": 8.0}
 # An edge that is killed is replaced once a health check finds it gone.
 _HEALTH_PERIOD_S, _HEALTH_TIMEOUT_S = 1.0, 10.0
 # The edge's own end takes up to 9 s.
@@ -132,13 +132,14 @@ async def _in_time(ask: Callable[[], Awaitable[Answered]], within_s: float) -> A
         raise OwnersGone(repr(error)) from None
 
 
-def deployed(settings: Settings, host: str | None, least: int, most: int) -> ServeOwners:
+def deployed(settings: Settings, host: str | None, least: int, most: int, **scaling: float) -> ServeOwners:
     """From ``least`` to ``most`` replicas, by load, on the Ray to which this process is connected.
 
     Replicas that another ingress has started with the same settings are reused.
 
     Args:
         host: as of :class:`Owner`.
+        scaling: other fields of Ray Serve's ``AutoscalingConfig``.
 
     Raises:
         RayUnusable: there are replicas with other settings, or new ones cannot be loaded.
@@ -163,7 +164,7 @@ def deployed(settings: Settings, host: str | None, least: int, most: int) -> Ser
         graceful_shutdown_timeout_s=_SHUTDOWN_S,
         # The edge has a log of its own.
         logging_config=LoggingConfig(log_level="WARNING", enable_access_log=False),
-        autoscaling_config=AutoscalingConfig(min_replicas=least, max_replicas=most, target_ongoing_requests=_ONGOING),
+        autoscaling_config=AutoscalingConfig(min_replicas=least, max_replicas=most, **_SCALING | scaling),
         request_router_config=RequestRouterConfig.model_validate(
             {"request_router_class": _ROUTER, "request_router_kwargs": {"num_fallback_replicas": 0}}
         ),

@@ -141,18 +141,15 @@ class LearningQueue:
     def add(self, task: TrainingTask) -> None:
         """Train two iterations of the event loop later, after the current decision's request to the LLM or the disk."""
         if not self._waiting:
-            self._loop.call_soon(self._loop.call_soon, self._train_some)
+            self._loop.call_soon(self._loop.call_soon, self.train_some)
         self._waiting.append(task)
 
-    def _train_some(self) -> None:
-        """Train on one task and a quarter of the rest: no request waits long, and the queue keeps up with the arrivals.
-
-        One iteration may bring 64 outcomes, from 64 UAVs.
-        """
+    def train_some(self) -> None:
+        """Train on one task and a quarter of the rest: 64 UAVs bring 64 outcomes at once, and no request waits long."""
         for _ in range(min(len(self._waiting), 1 + len(self._waiting) // 4)):
             self._train(self._waiting.popleft())
         if self._waiting:
-            self._loop.call_soon(self._train_some)
+            self._loop.call_soon(self.train_some)
 
     def skip(self) -> None:
         """Count an outcome that is not used for training; under overload hundreds a second share one warning."""

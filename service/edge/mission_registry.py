@@ -77,7 +77,7 @@ class MissionRegistry:
             Unavailable: the store cannot be read, or loading takes too long.
             Conflict: the stored mission is damaged.
         """
-        mission = await self._find(mission_id, _LOAD_S)
+        mission = await self.find(mission_id, _LOAD_S)
         if mission is None:
             raise NotFound("mission_id", f"there is no mission {mission_id}")
         return mission
@@ -124,7 +124,7 @@ class MissionRegistry:
             mission = None
         within = Deadline(deadline.at - RESERVE_S)
         if mission is None:
-            mission = await self._find(mission_id, within.left())
+            mission = await self.find(mission_id, within.left())
         if mission is not None and key is not None and mission.idempotent_answers.knows(key):
             return mission, request
         if mission is None:
@@ -146,7 +146,7 @@ class MissionRegistry:
             Misdirected: another edge has it.
             Unavailable: the store fails.
         """
-        mission = await self._find(mission_id, _LOAD_S)
+        mission = await self.find(mission_id, _LOAD_S)
         if mission is None:
             self.refuse_if_failing("mission_id")
             new = Mission(mission_id, spec, self._settings)
@@ -197,7 +197,7 @@ class MissionRegistry:
     def _listed(self) -> set[str]:
         return set() if self._store is None else self._store.listed
 
-    async def _find(self, mission_id: str, within_s: float) -> Mission | None:
+    async def find(self, mission_id: str, within_s: float) -> Mission | None:
         """The mission, loaded where it is not in memory or where this edge does not have its lease."""
         if mission_id in self._missions and self._ownership.owns(mission_id):
             return self._missions[mission_id]

@@ -75,7 +75,7 @@ class StoredMissions:
             Conflict: the stored mission is damaged.
         """
         if self.ownership.shared or mission_id in self.listed:
-            await self._share(mission_id, self._load, within_s)
+            await self.share(mission_id, self._load, within_s)
 
     async def claim(self, mission_id: str, within_s: float) -> None:
         """Take the lease of a new mission; load the mission if another edge has made it meanwhile.
@@ -83,7 +83,7 @@ class StoredMissions:
         Raises: as :meth:`load`.
         """
         while not self.ownership.owns(mission_id):
-            await self._share(mission_id, self._take, within_s)
+            await self.share(mission_id, self._take, within_s)
 
     async def claim_to_delete(self, mission_id: str) -> None:
         """Take the lease of a mission in memory or in the store, without loading it; raises as :meth:`load`."""
@@ -101,7 +101,7 @@ class StoredMissions:
         """Load no more missions."""
         self._reading.shutdown(wait=False, cancel_futures=True)
 
-    async def _share(self, mission_id: str, work: Callable[[str], Coroutine[Any, Any, None]], within_s: float) -> None:
+    async def share(self, mission_id: str, work: Callable[[str], Coroutine[Any, Any, None]], within_s: float) -> None:
         """Start work on a mission, or join the work in progress; concurrent requests share its result."""
         task = self._under_way.get(mission_id)
         if task is None:

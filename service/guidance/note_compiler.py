@@ -39,8 +39,8 @@ log = logging.getLogger(__name__)
 _ATTEMPTS = 5
 _TEMPERATURE = 0.7
 # For one answer, including the wait while decisions use the LLM, and for the whole note, including the LLM's loading.
-_ANSWER_S = 60.0
-_TIMEOUT_S = 300.0
+ANSWER_S = 60.0
+TIMEOUT_S = 300.0
 _POLL_S = 0.2
 _NOT_JUDGED = "How well this LLM reads notes is not known: compare each order with the note."
 
@@ -164,7 +164,7 @@ class NoteCompiler:
         phrased = PhrasedNote(text, mission.scenario, mission.guidance.confirmed.values)
         unclear += phrased.unsaid
         try:
-            async with asyncio.timeout(_TIMEOUT_S), self._lock:
+            async with asyncio.timeout(TIMEOUT_S), self._lock:
                 if not phrased.is_read:
                     await self._wait_for_llm()
                 if not _waits_for(mission, note):
@@ -214,7 +214,7 @@ async def compile_note(note: PhrasedNote, scenario: Scenario, llm: ServerPool) -
         if note.is_read:
             reading = NoteReading(NO_GUIDANCE)
         elif llm.reads_letters:
-            async with asyncio.timeout(_ANSWER_S):
+            async with asyncio.timeout(ANSWER_S):
                 reading = await read_note(note.text, scenario, llm)
         else:
             reading = await _rewrite_note(note.text, scenario, llm)
@@ -238,7 +238,7 @@ async def _rewrite_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteR
     faults: list[BadOrders | Impossible] = []
     for attempt in range(_ATTEMPTS):
         temperature = _TEMPERATURE if attempt else 0.0
-        async with asyncio.timeout(_ANSWER_S):
+        async with asyncio.timeout(ANSWER_S):
             text = (await llm.rewrite(rewriting, temperature=temperature, seed=attempt)).text
         try:
             guidance = parse_orders(text, note)

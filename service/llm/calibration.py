@@ -27,7 +27,7 @@ _TINY = 1e-12
 _LEAST_MASS = 1e-3
 _MOST_BIASES = 64
 _ATTEMPTS = 3
-_TIMEOUT_S = 30.0
+TIMEOUT_S = 30.0
 # Asks the LLM: a static block, a user message, and the lists of labels.
 Ask = Callable[[str, str, Sequence[Sequence[str]]], Awaitable[Completion]]
 # The model, the static block, and the number of lists of labels.
@@ -143,7 +143,7 @@ class LabelReader:
 
     async def _measure(self, ask: Ask, key: _Question, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
         try:
-            async with asyncio.timeout(_TIMEOUT_S):
+            async with asyncio.timeout(TIMEOUT_S):
                 answers = [await ask(key[1], text, lists) for text in texts]
             measured = [probabilities(answer, lists) for answer in answers]
         except (NoDecision, TimeoutError) as error:

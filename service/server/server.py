@@ -53,7 +53,7 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 _BYTES = 128 * 1024
 
 
-class _OncePerMinute(logging.Filter):
+class OncePerMinute(logging.Filter):
     """Drops a warning that was logged within the last minute; errors with a traceback pass."""
 
     def __init__(self) -> None:
@@ -72,7 +72,7 @@ class _OncePerMinute(logging.Filter):
 
 
 for _logger in (log, logging.getLogger("uvicorn.error")):
-    _logger.addFilter(_OncePerMinute())
+    _logger.addFilter(OncePerMinute())
 
 
 class _Refused(Exception):

@@ -14,9 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from lab import executors
 from lab.commands import explore
-from lab.executors import executor
+from lab.executors import RayExecutor, executor, in_order
 from lab.experiments.flight import FlightRecord, FlightStore
 from lab.experiments.result import Result
 from lab.experiments.runner import FLIGHTS, RESULT
@@ -128,14 +127,11 @@ class TestExecutor:
         assert type(raised) is ValueError
         assert str(raised) == "invalid literal for int() with base 10: 'seven'"
 
-    def test_a_map_is_in_order_and_does_not_read_all_that_it_is_given(
-        self, on_ray: Executor, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(executors, "_AHEAD", 4)
-        endless = executors._in_order(on_ray, math.factorial, count())
+    def test_a_map_is_in_order_and_does_not_read_all_that_it_is_given(self, on_ray: Executor) -> None:
+        endless = in_order(on_ray, math.factorial, count(), ahead=4)
         assert list(islice(endless, 9)) == [math.factorial(n) for n in range(9)]
 
-    def test_a_worker_with_another_release_is_refused(self, on_ray: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(on_ray, "_release", "0.0.0")
+    def test_a_worker_with_another_release_is_refused(self, on_ray: Executor) -> None:
+        assert isinstance(on_ray, RayExecutor)
         with pytest.raises(RayUnusable, match=r"a worker has aic-vds .*, this machine 0\.0\.0"):
-            on_ray.submit(math.factorial, 3).result()
+            RayExecutor("0.0.0").submit(math.factorial, 3).result()

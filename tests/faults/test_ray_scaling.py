@@ -63,18 +63,12 @@ def decided(client: httpx.Client, body: dict[str, Any]) -> int:
 
 # Ray's own, when Ray Serve is imported.
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
-def test_an_edge_is_added_under_load_and_ended_without(
-    database: Database, report: Report, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_edge_is_added_under_load_and_ended_without(database: Database, report: Report) -> None:
     with connected(LOCAL, 2):
         # Ray reads its settings when it is imported.
-        from ray.serve.config import AutoscalingConfig
+        from service.cluster.replicas import deployed, ended
 
-        from service.cluster import replicas as ray_serve
-
-        delays = {"upscale_delay_s": 2.0, "downscale_delay_s": 6.0}
-        monkeypatch.setattr(ray_serve, "AutoscalingConfig", lambda **given: AutoscalingConfig(**given, **delays))
-        monkeypatch.setattr(ray_serve, "_ONGOING", 1)
+        scaling = {"target_ongoing_requests": 1.0, "upscale_delay_s": 2.0, "downscale_delay_s": 6.0}
         own = Settings(
             store=database.url,
             mode="value",
@@ -82,8 +76,8 @@ def test_an_edge_is_added_under_load_and_ended_without(
             lease_s=LEASE_S,
             deadline_ms=DEADLINE_MS,
         )
-        owners = ray_serve.deployed(own, "127.0.0.1", 1, 2)
-        app = ingress_application(own, owners, ray_serve.ended)
+        owners = deployed(own, "127.0.0.1", 1, 2, **scaling)
+        app = ingress_application(own, owners, ended)
         with serving(app) as url, httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
             until(lambda: client.get("/readyz").status_code == 200)
             assert len(samples(client, "aicvds_missions")) == 1

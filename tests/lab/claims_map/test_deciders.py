@@ -38,7 +38,7 @@ def test_mode_value_loses_what_it_loses_over_an_edge(spec: dict[str, Any], monke
 def test_a_mission_of_reports_alone_does_not_need_the_belief(monkeypatch: pytest.MonkeyPatch) -> None:
     unfed = lost_here(REPORTED, monkeypatch)
     fed = lambda fleet, request: fleet.mission.observe(request, request.step)  # noqa: E731
-    monkeypatch.setattr(EdgeFleet, "_observe", fed)
+    monkeypatch.setattr(EdgeFleet, "observe", fed)
     assert lost_here(REPORTED, monkeypatch) == unfed
 
 

@@ -66,7 +66,7 @@ def test_a_request_that_comes_at_once_decides_with_every_earlier_outcome_learned
     tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The event loop may read the next request before it trains: here it never trains by itself."""
-    monkeypatch.setattr(LearningQueue, "_train_some", lambda queue: None)
+    monkeypatch.setattr(LearningQueue, "train_some", lambda queue: None)
     with running(tmp_path / "busy.db") as (client, engine):
         first = client.post("/decide", json=report(step=1)).json()
         outcome = {"outcome": {"decision_id": first["decision_id"], "cost": 7.0}}

@@ -132,13 +132,13 @@ def test_a_decision_that_comes_while_its_mission_is_made_waits_for_it(
     monkeypatch.setattr(Leases, "acquire", slowly)
     stored = engine.missions._store
     assert stored is not None
-    share, came = stored._share, list[str]()
+    share, came = stored.share, list[str]()
 
     async def sharing(mission_id: str, *args: Any) -> None:
         came.append(mission_id)
         await share(mission_id, *args)
 
-    monkeypatch.setattr(stored, "_share", sharing)
+    monkeypatch.setattr(stored, "share", sharing)
     with ThreadPoolExecutor(2) as pool, gate:
         made = pool.submit(client.put, "/missions/test", json={})
         until(lambda: gate.came)

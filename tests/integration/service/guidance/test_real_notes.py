@@ -19,8 +19,8 @@ from tests.support.waiting import PATIENCE_S
 # A busy machine may need minutes for the three readings of a note.
 pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 _LIMITS = (
-    *("guidance.note_compiler._ANSWER_S", "guidance.note_compiler._TIMEOUT_S", "llm.connection.PROBE_TIMEOUT_S"),
-    *("llm.probing.TOGETHER_TIMEOUT_S", "llm.calibration._TIMEOUT_S"),
+    *("guidance.note_compiler.ANSWER_S", "guidance.note_compiler.TIMEOUT_S", "llm.connection.PROBE_TIMEOUT_S"),
+    *("llm.probing.TOGETHER_TIMEOUT_S", "llm.calibration.TIMEOUT_S"),
 )
 LEAK = {"sensors": [{"sensor_id": 4, "visit_every": 3}]}
 LEAK_AND_LIMIT = {**LEAK, "max_velocity": 9}

@@ -27,7 +27,7 @@ def app() -> FastAPI:
 def ready(app: FastAPI) -> Iterator[httpx.Client]:
     with ExitStack() as stack:
         patient = stack.enter_context(pytest.MonkeyPatch.context())
-        for limit in ("connection.PROBE_TIMEOUT_S", "probing.TOGETHER_TIMEOUT_S", "calibration._TIMEOUT_S"):
+        for limit in ("connection.PROBE_TIMEOUT_S", "probing.TOGETHER_TIMEOUT_S", "calibration.TIMEOUT_S"):
             patient.setattr(f"service.llm.{limit}", PATIENCE_S)
         url = stack.enter_context(serving(app))
         client = stack.enter_context(httpx.Client(base_url=url, timeout=PATIENCE_S))

@@ -27,7 +27,7 @@ NAMES, SLOTS = ("first", "second"), 2
 
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    for limit in ("connection.PROBE_TIMEOUT_S", "probing.TOGETHER_TIMEOUT_S", "calibration._TIMEOUT_S"):
+    for limit in ("connection.PROBE_TIMEOUT_S", "probing.TOGETHER_TIMEOUT_S", "calibration.TIMEOUT_S"):
         monkeypatch.setattr(f"service.llm.{limit}", PATIENCE_S)
     monkeypatch.setattr("service.llm.server.RETRY_S", 0.2)
 

@@ -60,8 +60,7 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The lines of the log from now on, as the first ones of their minute."""
     written: list[str] = []
     for logger in (logging.getLogger("uvicorn.error"), server.log):
-        for once in logger.filters:
-            monkeypatch.setattr(once, "_quiet_until", {})
+        monkeypatch.setattr(logger, "filters", [server.OncePerMinute()])
         monkeypatch.setattr(logger, "callHandlers", lambda record: written.append(record.getMessage()))
     return written
 

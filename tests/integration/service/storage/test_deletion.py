@@ -91,7 +91,7 @@ def test_a_mission_deleted_while_it_wakes_stays_deleted(
     with running(tmp_path / "m.db") as (client, _):
         fly(client, report, range(2))
     load, gate = Store.load, Gate()
-    delete, find, came = MissionRegistry.delete, MissionRegistry._find, list[str]()
+    delete, find, came = MissionRegistry.delete, MissionRegistry.find, list[str]()
 
     def slowly(self: Store, mission_id: str) -> StoredMission | None:
         gate.wait()
@@ -107,7 +107,7 @@ def test_a_mission_deleted_while_it_wakes_stays_deleted(
 
     monkeypatch.setattr(Store, "load", slowly)
     monkeypatch.setattr(MissionRegistry, "delete", deleting)
-    monkeypatch.setattr(MissionRegistry, "_find", finding)
+    monkeypatch.setattr(MissionRegistry, "find", finding)
     with running(tmp_path / "m.db") as (client, _), ThreadPoolExecutor(3) as pool, gate:
         got = pool.submit(client.get, "/missions/test")
         until(lambda: gate.came)

@@ -87,9 +87,11 @@ def test_a_reader_that_ends_early_gets_no_traceback(arguments: list[str]) -> Non
 
 
 def test_another_broken_pipe_is_an_error_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken() -> int:
+    def broken(rest: list[str]) -> int:
         raise BrokenPipeError("a socket")
 
-    monkeypatch.setattr(cli, "_run", broken)
+    command = SimpleNamespace(name="demo", value="simulator.commands.demo:main", load=lambda: broken)
+    monkeypatch.setattr(cli, "entry_points", lambda group: [command])
+    monkeypatch.setattr(sys, "argv", ["aicvds", "demo"])
     with pytest.raises(BrokenPipeError, match="a socket"):
         cli.main()

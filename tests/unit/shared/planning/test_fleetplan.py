@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ortools.sat.python import cp_model
 
 from shared.planning.fleet_problem import FleetProblem, fly
 from shared.planning.greedy import look_ahead
@@ -156,7 +157,7 @@ def test_ctrl_c_ends_a_search_with_the_best_so_far(monkeypatch: pytest.MonkeyPat
     def interrupted(*_: Any) -> Any:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("simulator.bound.solver._search", interrupted)
+    monkeypatch.setattr(cp_model.CpSolver, "solve", interrupted)
     problem = tiny(1, horizon=8)
     with pytest.raises(Interrupted) as stopped:
         least_loss(problem, seconds=60, workers=1)
