@@ -14,27 +14,20 @@ from shared.wire.missions import LearnedWorld, MissionAttention, MissionStatus, 
 
 # The least mean excess loss of a reported sensor, dB.
 _REPORTED_DB = 1.0
+# Fields of the answer that a mission has, and its spec.
+_OF_MISSION = ("mission_id", "scenario", "mode", "top_k", "features", "decisions", "feedback")
+_OF_SPEC = ("attention", "verify", "prompt", "init", "seed", "names")
 
 
 def status_of(mission: Mission) -> MissionStatus:
     """A mission's setup and progress."""
     visits = mission.records.visits
     return MissionStatus(
-        mission_id=mission.mission_id,
-        scenario=mission.scenario,
-        mode=mission.mode,
-        top_k=mission.top_k,
-        attention=mission.spec.attention,
-        features=mission.features,
+        **{name: getattr(mission, name) for name in _OF_MISSION},
+        **{name: getattr(mission.spec, name) for name in _OF_SPEC},
         belief=mission.belief_source,
         planner="off" if mission.planner is None else "on",
-        verify=mission.spec.verify,
-        prompt=mission.spec.prompt,
-        init=mission.spec.init,
-        seed=mission.spec.seed,
         note=mission.guidance.note,
-        decisions=mission.decisions,
-        feedback=mission.feedback,
         experiences=len(mission.experiences.block),
         learner_updates=mission.learner.updates,
         learner_loss=mission.learner.last_loss,
@@ -42,7 +35,6 @@ def status_of(mission: Mission) -> MissionStatus:
         learned=learned_world(mission.belief),
         deadlines=mission.deadlines() or None,
         readings=mission.readings.merged or None,
-        names=mission.spec.names,
     )
 
 

@@ -201,6 +201,7 @@ class OperatorGuidance:
         in_words = None if self._proposed is None else self._proposed.in_words()
         if in_words and not self._proposed and (self._withdrawn or self.confirmed):
             in_words = "No new order."
+        records = (*self._over, *self._in_force.values())
         return GuidanceStatus(
             mission_id=mission_id,
             status=self.status,
@@ -215,10 +216,7 @@ class OperatorGuidance:
             **{key: list(map(named, change)) for key, change in changed.items()},
             begun=list(map(named, self._begun)),
             ended=list(map(named, self._ended)),
-            orders=[
-                record.model_copy(update={"in_words": named(record.in_words)})
-                for record in (*self._over, *self._in_force.values())
-            ],
+            orders=[one.model_copy(update={"in_words": named(one.in_words)}) for one in records],
             version=self.version,
         )
 

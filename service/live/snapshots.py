@@ -87,6 +87,7 @@ def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
     belief, scenario = mission.belief, mission.scenario
     step = belief.newest or 0
     queue, rate, orders = belief.queue(step), belief.arrivals.rate, mission.deadlines()
+    measured = belief.channel.radio_map.measured_db()
     return {
         "step": step,
         "made": mission.decisions,
@@ -104,11 +105,7 @@ def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
         "heard": belief.heard.tolist(),
         "visits": mission.records.visits.tolist(),
         "failed_radios": belief.channel.failures.dead,
-        "excess_db": {
-            sensor: round(excess, 1)
-            for sensor, excess in belief.channel.radio_map.measured_db().items()
-            if excess >= _WORSE_DB
-        },
+        "excess_db": {sensor: round(db, 1) for sensor, db in measured.items() if db >= _WORSE_DB},
         "step_took_s": watched.step_took_s,
         "uavs": {uav: _uav(mission, watched, uav) for uav in belief.uavs},
     }

@@ -73,15 +73,8 @@ def _without_llm(summary: Summary) -> str:
 def _others(summary: Summary) -> str:
     """The decisions without the LLM, by decider, and their reasons."""
     by = summary.by_source
-    owners = [
-        f"{count} by {owner}"
-        for owner, count in (
-            ("the edge's LLM-free policy", by.policy),
-            ("its learned values", by.value),
-            ("the UAVs themselves", by.onboard),
-        )
-        if count
-    ]
+    made = {"the edge's LLM-free policy": by.policy, "its learned values": by.value, "the UAVs themselves": by.onboard}
+    owners = [f"{count} by {owner}" for owner, count in made.items() if count]
     reasons = ", ".join(f"{reason} {count}" for reason, count in summary.by_reason.items())
     return f"{' and '.join(owners)} (reasons: {reasons or 'none given'})"
 
