@@ -24,7 +24,7 @@ help:
 	@echo "make test-long install, run the tests that train, run experiments and benchmarks, and fly whole missions"
 	@echo "make check     install, ruff, mypy --strict, import-linter"
 	@echo "make docs      install, build the documentation into site/, to be read without a network"
-	@echo "make bench     measure the edge and its LLM, side by side with others: runs/*.json; 25 minutes"
+	@echo "make bench     measure the edge and its LLM, side by side with others: docs/results/benchmarks.md; 9 minutes"
 	@echo "make faults    fail, kill and starve real processes, and write docs/results/faults.md: 10 minutes"
 	@echo "make fuzz      10,000 generated requests, maps and plans: none breaks the edge, or flies outside its fences"
 	@echo "make soak      fly 200 missions for MINUTES=10: memory, tasks and connections must not grow"
@@ -73,21 +73,9 @@ check: install
 docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-# The figures in docs/results/benchmarks.md have more rounds. About 25 minutes on two idle cores, estimated: startup to
-# world took 15 of them on a slow day, the last three were not measured together. The page needs Chromium.
-BENCH = $(BIN)/python -m benchmarks
+# On two idle cores. The other modules of benchmarks/ measure more of each, and have --help.
 bench: install
-	$(BENCH).startup --rounds 3
-	$(BENCH).overhead --rounds 5
-	$(BENCH).processor_stages
-	$(BENCH).tokens --seeds 3
-	$(BENCH).llm --rounds 3
-	$(BENCH).sensors
-	$(BENCH).fleet
-	$(BENCH).world
-	$(BENCH).planning --rounds 2
-	$(BENCH).capacity
-	-$(BENCH).page --seconds 10
+	$(BIN)/python -m benchmarks.questions --page docs/results/benchmarks.md
 
 faults: install
 	$(BIN)/pytest -m faults --capture=tee-sys tests/faults tests/e2e/test_fly.py
@@ -96,7 +84,7 @@ fuzz: install
 	$(BIN)/pytest -m fuzz --capture=tee-sys tests/faults tests/unit
 
 soak: install
-	$(BENCH).soak --minutes $(MINUTES)
+	$(BIN)/python -m benchmarks.soak --minutes $(MINUTES)
 
 compose:
 	tests/e2e/compose.sh
