@@ -49,6 +49,8 @@ Leases.fence = lambda self, db, missions: None
 # About the journal of one decision, its report and its outcome.
 _ROW_BYTES = 2000
 _RENEWALS = 10
+# Modes, each with the planner on or off.
+MODES = (("value", "on"), ("llm", "off"), ("llm", "on"), ("guided", "off"), ("guided", "on"))
 
 
 @dataclass(frozen=True)
@@ -219,10 +221,10 @@ def with_and_without_fence(folder: Path, database: Database, args: Capacity) -> 
     return {"p50_ms": took, "ratio": ratio_of_medians(took["fence"], took["none"])}
 
 
-def modes(folder: Path, args: Capacity) -> dict[str, dict[str, float]]:
+def modes(folder: Path, args: Capacity, which: Sequence[tuple[str, str]] = MODES) -> dict[str, dict[str, float]]:
     """An edge's processor seconds a decision, by mode: flights in scenario ``paper`` with SQLite and an instant LLM."""
     found = {}
-    for mode, planner in (("value", "on"), ("llm", "off"), ("llm", "on"), ("guided", "off"), ("guided", "on")):
+    for mode, planner in which:
         with (
             instant_llm() as llm,
             edge({"MODE": mode, "PLANNER": planner, "LLM_URL": f"{llm.url}/v1", "LOG_LEVEL": "info"}) as server,

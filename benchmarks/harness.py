@@ -252,7 +252,8 @@ def edge(
             "/readyz",
             environment(settings) | dict(variables or {}),
             checkout or ROOT,
-            lambda answer: answer.json()["llm"] == "ready" if named else answer.json()["llm"] != "loading",
+            # Modes value and policy ask no LLM: theirs is off.
+            lambda answer: answer.json()["llm"] in ("ready", "off") if named else answer.json()["llm"] != "loading",
         ) as server:
             yield server
 

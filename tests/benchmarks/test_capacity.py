@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.capacity import Capacity, modes
 from tests.benchmarks.running import figures
 
 pytestmark = pytest.mark.long
@@ -21,3 +22,9 @@ def test_it_tells_costs_and_predicts_from_them(tmp_path: Path) -> None:
     # No more than what is there can have been used.
     assert 0 < told["decisions_a_s"] * spent == pytest.approx(told["cores_used"])
     assert found["commits_a_s"]["1"] > 0 and found["renewal"]["leases"] == 5
+
+
+def test_the_cost_of_a_decision_in_a_mode_that_asks_no_llm(tmp_path: Path) -> None:
+    found = modes(tmp_path, Capacity(flights=1), (("value", "on"),))
+    (told,) = found.values()
+    assert list(found) == ["value, planner on"] and 0 < told["edge_s"] < 1 and told["decisions_a_s"] > 0
