@@ -30,7 +30,7 @@ from benchmarks.harness import Cell, Goal, Options, Report, Rows, run, shown
 LONGEST_S = 600.0
 _BEGIN, _END = "<!-- five tables -->", "<!-- end of the five tables -->"
 # Sensors and missions that are compared, the fewest first.
-_SENSORS, _MISSIONS = (10, 100, 1000), (1, 10, 100)
+_SENSORS, _MISSIONS = (10, 100, 1000), (1, 10, 100, 1000)
 _LLM_RATIOS = {
     "guided, 2 threads: cached / cold": "mode `guided`: prefix in the cache, to an empty cache",
     "llm, 2 threads: cached / cold": "mode `llm`: prefix in the cache, to an empty cache",
@@ -52,13 +52,13 @@ class Questions(Options):
 def measure(args: Questions) -> Report:
     """Measure one after the other."""
     began = time.monotonic()
-    loads = overhead.measure(overhead.Overhead(rounds=3, litellm=args.litellm))
+    loads = overhead.measure(overhead.Overhead(rounds=5, litellm=args.litellm))
     rows = {(row["service"], row["uavs"]): row for row in loads.figures["rows"]}
     with tempfile.TemporaryDirectory() as folder:
         modes = capacity.modes(Path(folder), capacity.Capacity(flights=1))
     reports = {
-        "sensors": sensors.measure(sensors.Sensors(sensors=_SENSORS, steps=4, rounds=1)),
-        "missions": fleet.measure(fleet.Fleet(missions=_MISSIONS, decisions=600, each=4, veterans=10, rounds=1)),
+        "sensors": sensors.measure(sensors.Sensors(sensors=_SENSORS, rounds=2)),
+        "missions": fleet.measure(fleet.Fleet(missions=_MISSIONS, decisions=600, rounds=1)),
         "start": startup.measure(startup.Startup(rounds=2)),
         "llm": llm.measure(llm.Llm(rounds=3)),
     }
