@@ -6,12 +6,15 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.harness import Rows
 from benchmarks.questions import write
 from tests.support.places import ROOT
 
 pytestmark = pytest.mark.long
 
-TABLES = {"1. What is asked": {"a row": {"ms": 1.5, "ratio": [0.5, 0.4, 0.61]}, "another": {"ratio": 1234.0}}}
+TABLES: dict[str, Rows] = {
+    "1. What is asked": {"a row": {"ms": 1.5, "ratio": [0.5, 0.4, 0.61]}, "another": {"ratio": 1234.0}}
+}
 
 
 def test_the_tables_replace_those_of_the_page_and_nothing_else(tmp_path: Path) -> None:
