@@ -24,7 +24,7 @@ help:
 	@echo "make test-long install, run the tests that train, run experiments and benchmarks, and fly whole missions"
 	@echo "make check     install, ruff, mypy --strict, import-linter"
 	@echo "make docs      install, build the documentation into site/, to be read without a network"
-	@echo "make bench     measure the edge and its LLM, side by side with others: docs/results/benchmarks.md; 9 minutes"
+	@echo "make bench     measure the edge and its LLM, side by side with others: docs/results/benchmarks.md; 7 minutes"
 	@echo "make faults    fail, kill and starve real processes, and write docs/results/faults.md: 10 minutes"
 	@echo "make fuzz      10,000 generated requests, maps and plans: none breaks the edge, or flies outside its fences"
 	@echo "make soak      fly 200 missions for MINUTES=10: memory, tasks and connections must not grow"
