@@ -1,4 +1,4 @@
-# make install | demo | test | test-long | check | docs | bench | faults | fuzz | soak | compose | release | clean
+# make install | demo | test | test-long | check | docs | bench | bench-all | faults | fuzz | soak | compose | release | clean
 #
 # TORCH_INDEX: for the tests and the laboratory, on a machine with the whole internet, the address of PyTorch's CPU index:
 # its "Get Started" selector prints it after --index-url. Unset, torch comes from the ordinary index (on Linux the CUDA
@@ -14,7 +14,7 @@ BIN := .venv/bin
 export PYTHONDONTWRITEBYTECODE :=
 
 # mypy 2.4 may infer different types in different runs, by the order of its sets: PYTHONHASHSEED makes its result stable.
-.PHONY: help install demo test test-long check docs bench faults fuzz soak compose release clean
+.PHONY: help install demo test test-long check docs bench bench-all faults fuzz soak compose release clean
 .DEFAULT_GOAL := help
 
 help:
@@ -25,6 +25,7 @@ help:
 	@echo "make check     install, ruff, mypy --strict, import-linter"
 	@echo "make docs      install, build the documentation into site/, to be read without a network"
 	@echo "make bench     measure the edge and its LLM, side by side with others: docs/results/benchmarks.md; 7 minutes"
+	@echo "make bench-all the same, and the other benchmarks: runs/*.json"
 	@echo "make faults    fail, kill and starve real processes, and write docs/results/faults.md: 10 minutes"
 	@echo "make fuzz      10,000 generated requests, maps and plans: none breaks the edge, or flies outside its fences"
 	@echo "make soak      fly 200 missions for MINUTES=10: memory, tasks and connections must not grow"
@@ -76,6 +77,15 @@ docs: install
 # On two idle cores. The other modules of benchmarks/ measure more of each, and have --help.
 bench: install
 	$(BIN)/python -m benchmarks.questions --page docs/results/benchmarks.md
+
+# The page needs Chromium.
+bench-all: bench
+	$(BIN)/python -m benchmarks.processor_stages
+	$(BIN)/python -m benchmarks.tokens --seeds 3
+	$(BIN)/python -m benchmarks.world
+	$(BIN)/python -m benchmarks.planning --rounds 2
+	$(BIN)/python -m benchmarks.capacity
+	-$(BIN)/python -m benchmarks.page --seconds 10
 
 faults: install
 	$(BIN)/pytest -m faults --capture=tee-sys tests/faults tests/e2e/test_fly.py

@@ -118,10 +118,10 @@ def _growth(
         few, many = (rows[service, uavs]["cpu"] for uavs in (3, 64))
         found[f"64 UAVs at once to 3: {named} processor time"] = {"ratio": many / few}
     rates = by_missions["rates"]
-    first, *more = map(str, _MISSIONS)
+    first, *more = _MISSIONS
     for most in more:
-        ratio = rates[first]["decisions_a_s"] / rates[most]["decisions_a_s"]
-        found[f"{most} missions to {first}: seconds a decision"] = {"ratio": ratio}
+        ratio = rates[str(first)]["decisions_a_s"] / rates[str(most)]["decisions_a_s"]
+        found[f"{most:,} missions to {first}: seconds a decision"] = {"ratio": ratio}
     return found
 
 

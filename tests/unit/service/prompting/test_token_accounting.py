@@ -65,6 +65,7 @@ def test_a_folder_that_cannot_be_written_to_is_read(tmp_path: Path) -> None:
     # A folder where the new file would be written to first.
     (tmp_path / "tiktoken" / f"o200k_base-{tiktoken.__version__}.{os.getpid()}").mkdir()
     assert len(encoding(tmp_path).encode_ordinary("hello world")) == 2
+    assert not list((tmp_path / "tiktoken").glob("*.msgpack"))
 
 
 def test_price() -> None:
