@@ -5,12 +5,12 @@
 It flies scenario `paper` with beacons and without (`observation_model: served`), in the same worlds, over an edge
 without an LLM: mode `policy`, mode `value` on the fleet's belief, and mode `value` on each UAV's own reports with the
 paper's features. It prints each one's lost packets and the ratio of the two, with 95% bootstrap intervals over worlds,
-and writes the same as JSON. A world takes some twenty seconds.
+and writes each world's as CSV. A world takes some twenty seconds.
 """
 
 from __future__ import annotations
 
-import json
+import csv
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.progress import track
 
 from lab.experiments.edges import Llm, edge_for
+from lab.experiments.execution import commit
 from lab.experiments.intervals import interval, paired
 from lab.experiments.schemes import OFF
 from shared.client.edge_client import EdgeClient
@@ -46,8 +47,8 @@ class ServedOnly:
     """Worlds: seeds 0 to N - 1."""
     steps: int = PAPER.steps
     """Steps of a mission."""
-    out: Path = Path("runs/served_only.json")
-    """Where to write the figures."""
+    out: Path = Path("runs/served-only.csv")
+    """Where to write each world's losses."""
 
 
 def flown(url: str, scenario: Scenario, seed: int, name: str, spec: dict[str, Any]) -> int:
@@ -81,7 +82,13 @@ def main(args: ServedOnly) -> None:
         for pair in paired(mode, "beacons", "lost_packets", lost[f"{mode}@served"], lost[f"{mode}@beacons"]):
             console.print(f"{mode}, served to beacons, {pair.kind}: {pair.mean:.2f} [{pair.low:.2f}, {pair.high:.2f}]")
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(lost, indent=1) + "\n")
+    with args.out.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(("experiment", "scenario", "scheme", "seed", "measure", "value", "commit"))
+        for name, values in lost.items():
+            mode, world = name.split("@")
+            for seed, value in enumerate(values):
+                table.writerow(("served-only", PAPER.name, mode, seed, f"lost_packets@{world}", value, commit()))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from lab.claims_map.flights import EVERY_SENSOR, Flown, chooser_name
+from lab.experiments.execution import commit
 from lab.experiments.intervals import curve, interval
 from lab.experiments.plots import PRINT, rounded
 from lab.paper_figures.measured import Trips
@@ -66,9 +67,9 @@ class Folder:
             svg.write_text(rounded(svg.read_text(encoding="utf-8")), encoding="utf-8")
 
     def numbers(self, name: str, header: Sequence[str], rows: Rows) -> None:
-        """Write ``NAME.csv``."""
+        """Write ``NAME.csv``, with the commit of this code in each row."""
         with (self._path / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows([header, *rows])
+            csv.writer(file, lineterminator="\n").writerows([[*header, "commit"], *([*row, commit()] for row in rows)])
 
 
 def losses(folder: Folder, name: str, looks: Looks, flights: Mapping[str, Flown]) -> None:

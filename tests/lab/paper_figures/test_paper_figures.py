@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from lab.claims_map.flights import SCHEMES, Flown
+from lab.experiments.execution import commit
 from lab.paper_figures import command, drawing
 from lab.paper_figures.command import FigureOptions, paper_figures
 from lab.paper_figures.measured import Trips, spatial_share, tokens_by_step
@@ -38,6 +39,7 @@ def test_curves_are_the_papers_schemes(tmp_path: Path) -> None:
     options = FigureOptions(out=tmp_path, figure=("losses", "attention", "visits"), runs=2)
     assert paper_figures(options, Console(quiet=True)) == 0
     rows = numbers(tmp_path / "losses.csv")
+    assert {row["commit"] for row in rows} == {commit() or ""}
     assert list(dict.fromkeys(row["scheme"] for row in rows)) == ["AIC-VDS", "MADQN", "MAPPO", "EOF", "WQCS"]
     assert len(rows) == 5 * 6
     assert len({row["scheme"] for row in numbers(tmp_path / "attention.csv")}) == 3
