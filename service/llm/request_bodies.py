@@ -167,15 +167,9 @@ def constrain_labels(constraint: Constraint, lists: Sequence[Sequence[str]]) -> 
 
 def json_schema(sensor_ids: list[int], velocities: list[int]) -> dict[str, Any]:
     """OpenAI's ``response_format`` for ``{"sensor_id": ..., "velocity": ...}``."""
-    schema = {
-        "type": "object",
-        "properties": {
-            "sensor_id": {"type": "integer", "enum": sensor_ids},
-            "velocity": {"type": "integer", "enum": velocities},
-        },
-        "required": ["sensor_id", "velocity"],
-        "additionalProperties": False,
-    }
+    fields = {"sensor_id": sensor_ids, "velocity": velocities}
+    properties = {name: {"type": "integer", "enum": allowed} for name, allowed in fields.items()}
+    schema = {"type": "object", "properties": properties, "required": [*fields], "additionalProperties": False}
     return {"type": "json_schema", "json_schema": {"name": "decision", "strict": True, "schema": schema}}
 
 

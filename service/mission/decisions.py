@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -53,24 +54,24 @@ class AppliedOutcomes:
     """
 
     def __init__(self, most: int) -> None:
-        # The key is the ID's bytes, half as large as its text: an edge remembers hundreds for each mission.
-        self._outcomes = BoundedDict[bytes, tuple[float, bool]](most)
+        # A mission remembers hundreds: the sign of the cost says whether the transmission failed.
+        self._outcomes = BoundedDict[str, float](most)
 
     def __contains__(self, decision_id: str) -> bool:
-        return bytes.fromhex(decision_id) in self._outcomes
+        return decision_id in self._outcomes
 
     def __getitem__(self, decision_id: str) -> tuple[float, bool]:
         """The cost, and whether the transmission failed."""
-        return self._outcomes[bytes.fromhex(decision_id)]
+        cost = self._outcomes[decision_id]
+        return abs(cost), math.copysign(1.0, cost) < 0
 
     def add(self, decision_id: str, cost: float, failed: bool) -> None:
         """Remember an outcome; past the limit the oldest is forgotten."""
-        # A cost of -0.0 is stored as 0.
-        self._outcomes[bytes.fromhex(decision_id)] = abs(cost), failed
+        self._outcomes[decision_id] = math.copysign(cost, -1.0 if failed else 1.0)
 
     def state_dict(self) -> list[tuple[str, float, bool]]:
         """Decision ID, cost and failure of each outcome, oldest first."""
-        return [(key.hex(), *outcome) for key, outcome in self._outcomes.items()]
+        return [(name, *self[name]) for name in self._outcomes]
 
     def load_state_dict(self, state: list[tuple[str, float, bool]]) -> None:
         """Restore a ``state_dict``."""

@@ -4,7 +4,7 @@ A report may leave out what the UAV's reference report or an earlier report has 
 """
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,15 +108,10 @@ class Reports:
         x, y = _positions_of(ids, positions, at)
         queue, battery, gain, seen = ([None if v != v else v for v in column.tolist()] for column in columns[1:])
         # Validation is skipped: each number passed it when its report arrived.
-        whole = SensorColumns.model_construct(
-            id=ids.tolist(),
-            x=x.tolist(),
-            y=y.tolist(),
-            queue=queue,
-            battery=battery,
-            channel_gain=gain,
-            last_seen=[None if step is None else int(step) for step in seen],
-        )
+        places: dict[str, Any] = {"id": ids.tolist(), "x": x.tolist(), "y": y.tolist()}
+        heard: dict[str, Any] = {"queue": queue, "battery": battery, "channel_gain": gain}
+        steps = [None if step is None else int(step) for step in seen]
+        whole = SensorColumns.model_construct(**places, **heard, last_seen=steps)
         return uav.model_copy(update={"base": None, "uplink": "delta", "sensors": whole})
 
     def _check_step(self, step: int) -> None:

@@ -4,6 +4,7 @@ What never changes comes first, for the LLM server's prefix cache: so the cost f
 """
 
 from collections.abc import Sequence
+from sys import intern
 
 from service.prompting.prompt import Prompt, note_block
 from service.prompting.rows import EXPERIENCE_NOTE, UNKNOWN, Cells, cells, columns, experience, introduction, row
@@ -74,7 +75,7 @@ class Template:
     ) -> None:
         self._columns = columns(features)
         order = "the most promising first" if ranked else "in no particular order"
-        self.static = _STATIC.format(
+        static = _STATIC.format(
             last=scenario.sensors - 1,
             max_velocity=scenario.max_velocity,
             step_s=scenario.step_s,
@@ -89,6 +90,8 @@ class Template:
             note=note_block(note),
             experiences=f"{EXPERIENCE_NOTE}\n\n" if experiences else "",
         )
+        # Missions of one scenario share the text.
+        self.static = intern(static)
 
     def experience(self, seen: Cells, action: Action, cost: float, failed: bool) -> str:
         """A line of the experiences: the chosen sensor's row, the decision and its cost, which includes a failure."""
