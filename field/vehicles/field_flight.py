@@ -21,7 +21,7 @@ from field.vehicles.radio import Collected, LossCounters, Radio, Spot
 from shared.wire.schemas import Mode
 from simulator.flying.pilots import PilotChoice
 from simulator.records.decision import Decision
-from simulator.records.flight import Flight, exchange_fields
+from simulator.records.flight import Flight
 from simulator.sites.site import Site
 from simulator.world.observation import StepTally
 
@@ -218,15 +218,11 @@ class FieldFlight:
                 step=step,
                 uav_id=index,
                 position=leg.spot.position,
-                sensor_id=leg.choice.sensor,
-                velocity=leg.choice.velocity,
-                source=leg.choice.source,
-                reason=leg.choice.reason,
                 failed=got.failed,
                 collected=got.packets,
                 lost_packets=lost[index],
                 cost=cost,
-                **exchange_fields(leg.choice.exchange),
+                **leg.choice.recorded(),
             )
             self.result.decisions.append(decision)
             self._on_decision(decision)

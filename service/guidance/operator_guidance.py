@@ -20,6 +20,8 @@ from shared.world.scenario import Scenario
 # Most ended orders in memory.
 _MOST_ENDED = 1000
 _ANSWERED = ("confirmed", "rejected")
+# Private attributes that are plain values of the state.
+_STATE = ("withdrawn", "origin", "model", "failure", "doubts", "begun", "ended")
 
 
 class OperatorGuidance:
@@ -256,14 +258,8 @@ class OperatorGuidance:
             "status": self.status,
             "obeyed": self.confirmed.model_dump(mode="json"),
             "understood": None if self._proposed is None else self._proposed.model_dump(mode="json"),
-            "withdrawn": self._withdrawn,
             "orders": [record.model_dump(mode="json") for record in (*self._over, *self._in_force.values())],
-            "origin": self._origin,
-            "model": self._model,
-            "failure": self._failure,
-            "doubts": self._doubts,
-            "begun": self._begun,
-            "ended": self._ended,
+            **{name: getattr(self, f"_{name}") for name in _STATE},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -273,9 +269,8 @@ class OperatorGuidance:
         self._obey(Guidance.model_validate(state["obeyed"]))
         proposed = state["understood"]
         self._proposed = None if proposed is None else Guidance.model_validate(proposed)
-        self._origin, self._model, self._failure = state["origin"], state["model"], state["failure"]
-        self._doubts, self._withdrawn = state["doubts"], state["withdrawn"]
+        for name in _STATE:
+            setattr(self, f"_{name}", state[name])
         records = [OrderRecord.model_validate(record) for record in state["orders"]]
         self._over = deque((record for record in records if record.until is not None), maxlen=_MOST_ENDED)
         self._in_force = {record.name: record for record in records if record.until is None}
-        self._begun, self._ended = state["begun"], state["ended"]

@@ -130,20 +130,16 @@ def _uav(mission: Mission, watched: Watched, uav: int) -> dict[str, Any]:
 
 def _guidance(mission: Mission) -> dict[str, Any]:
     """The operator's note, the guidance from it, the orders in force, and the visits that are due, with his names."""
-    visits, confirmed = mission.records.visits, mission.guidance.confirmed
+    visits, confirmed = mission.records.visits.tolist(), mission.guidance.confirmed
     report = mission.report_guidance().model_dump(exclude={"mission_id"})
     return {
         **report,
         "orders": [order for order in report["orders"] if order["until"] is None],
         "due": [
-            {
-                "sensor_id": wish.sensor_id,
-                "visit_every": wish.visit_every,
-                "due": int(visits[wish.sensor_id]) + wish.visit_every,
-            }
-            for wish in confirmed.sensors
-            if wish.visit_every is not None
-            and not once(name := f"visit:{wish.sensor_id}", wish.visit_every, confirmed.ends.get(name))
+            {"sensor_id": one.sensor_id, "visit_every": one.visit_every, "due": visits[one.sensor_id] + one.visit_every}
+            for one in confirmed.sensors
+            if one.visit_every is not None
+            and not once(name := f"visit:{one.sensor_id}", one.visit_every, confirmed.ends.get(name))
         ],
     }
 

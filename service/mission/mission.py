@@ -48,6 +48,8 @@ from shared.world.scenario import Scenario, scenario_named
 from shared.world.step_rule import Action
 
 log = logging.getLogger(__name__)
+# The attributes of a mission that have a ``state_dict`` of their own.
+_PARTS = ("pending", "idempotent_answers", "experiences", "records", "reservations", "belief", "visit_orders")
 
 
 class Mission:
@@ -242,34 +244,23 @@ class Mission:
         return {
             "decisions": self.decisions,
             "feedback": self.feedback,
-            "pending": self.pending.state_dict(),
-            "applied": self.pending.applied.state_dict(),
-            "idempotent_answers": self.idempotent_answers.state_dict(),
-            "experiences": self.experiences.state_dict(),
-            "records": self.records.state_dict(),
-            "reservations": self.reservations.state_dict(),
-            "belief": self.belief.state_dict(),
-            "guidance": self.guidance.state_dict(),
-            "visit_orders": self.visit_orders.state_dict(),
-            "trust": {model: trust.state_dict() for model, trust in self.trust.items()},
+            **{part: getattr(self, part).state_dict() for part in _PARTS},
             "readings": self.readings.state_dict(),
+            "applied": self.pending.applied.state_dict(),
+            "guidance": self.guidance.state_dict(),
+            "trust": {model: trust.state_dict() for model, trust in self.trust.items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a ``state_dict``; the plan is not part of it and is made again."""
         self.decisions, self.feedback = state["decisions"], state["feedback"]
-        self.pending.load_state_dict(state["pending"])
+        for part in _PARTS:
+            getattr(self, part).load_state_dict(state[part])
+        self.readings.load_state_dict(state["readings"])
         self.pending.applied.load_state_dict(state["applied"])
-        self.idempotent_answers.load_state_dict(state["idempotent_answers"])
-        self.experiences.load_state_dict(state["experiences"])
-        self.records.load_state_dict(state["records"])
-        self.reservations.load_state_dict(state["reservations"])
-        self.belief.load_state_dict(state["belief"])
         for model, trust in state["trust"].items():
             self.trust[model].load_state_dict(trust)
         self.restore_guidance(state["guidance"])
-        self.visit_orders.load_state_dict(state["visit_orders"])
-        self.readings.load_state_dict(state["readings"])
 
     def restore_guidance(self, state: dict[str, Any]) -> None:
         """Restore the operator's guidance from its ``state_dict``."""

@@ -70,14 +70,8 @@ class Readings:
         step, at_s = self.began
         since_began_s = time.monotonic() - at_s if step == newest else 0.0
         return [
-            PlacedReading(
-                sensor_id=reading.sensor_id,
-                step=self._step_of(reading, newest, since_began_s),
-                queue=reading.queue,
-                battery=reading.battery,
-                message_id=reading.message_id,
-            )
-            for reading in given
+            PlacedReading(r.sensor_id, self._step_of(r, newest, since_began_s), r.queue, r.battery, r.message_id)
+            for r in given
         ]
 
     def _step_of(self, reading: SensorReading, newest: int, since_began_s: float) -> int:

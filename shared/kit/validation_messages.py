@@ -10,11 +10,8 @@ _PREFIXES = ("Value error, ", "Assertion failed, ")
 _SUBJECT = re.compile(r"^[A-Z][a-z]+ should ")
 _PLAIN = {
     "missing": "is missing",
-    "dict_type": "must be a JSON object",
-    "model_type": "must be a JSON object",
-    "model_attributes_type": "must be a JSON object",
-    "list_type": "must be a list",
-    "tuple_type": "must be a list",
+    **dict.fromkeys(("dict_type", "model_type", "model_attributes_type"), "must be a JSON object"),
+    **dict.fromkeys(("list_type", "tuple_type"), "must be a list"),
     "bool_type": "must be true or false",
     "union_tag_invalid": "is of an unknown type",
     "union_tag_not_found": "has no type",

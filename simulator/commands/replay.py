@@ -240,17 +240,9 @@ def _replay_all(replayer: Replayer, logged: LoggedMission, out: Path, console: C
 def _decision(flown: Decision, exchange: Exchange) -> Decision:
     from simulator.records.flight import exchange_fields
 
-    answer = exchange.response
-    return Decision(
-        step=flown.step,
-        uav_id=flown.uav_id,
-        position=flown.position,
-        sensor_id=answer.sensor_id,
-        velocity=answer.velocity,
-        source=answer.source,
-        reason=answer.reason,
-        **exchange_fields(exchange),
-    )
+    asked = {name: getattr(flown, name) for name in ("step", "uav_id", "position")}
+    answered = {name: getattr(exchange.response, name) for name in ("sensor_id", "velocity", "source", "reason")}
+    return Decision(**asked, **answered, **exchange_fields(exchange))
 
 
 def check(options: Replay) -> None:

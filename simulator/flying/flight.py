@@ -10,7 +10,7 @@ from simulator.flying.job import BASELINES
 from simulator.flying.pilots import Pilot, PilotChoice
 from simulator.policies.registry import LearningPolicy, Policy, policy_named
 from simulator.records.decision import Decision
-from simulator.records.flight import Flight, exchange_fields
+from simulator.records.flight import Flight
 from simulator.records.mission_logs import DecisionLog
 from simulator.records.track import Instant
 from simulator.sites.site import Site
@@ -101,15 +101,11 @@ def _record(
             step=int(observation["step"][0]),
             uav_id=uav,
             position=(x, y),
-            sensor_id=choice.sensor,
-            velocity=choice.velocity,
-            source=choice.source,
-            reason=choice.reason,
             failed=bool(info["failed"]),
             collected=int(info["collected"]),
             lost_packets=int(info["lost_packets"]),
             cost=float(info["cost"]),
-            **exchange_fields(choice.exchange),
+            **choice.recorded(),
         )
         flight.decisions.append(decision)
         if log is not None:

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from shared.client.calls import Exchange
 from shared.client.edge_client import EdgeClient
@@ -12,6 +12,7 @@ from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mod
 from shared.world.scenario import Scenario
 from simulator.policies.registry import LearningPolicy, Policy, policy_named
 from simulator.records.decision import DecidedBy
+from simulator.records.flight import exchange_fields
 from simulator.world.observation import Observation, decide_request
 
 FALLBACK = "longest_queue"
@@ -26,6 +27,11 @@ class PilotChoice:
     source: DecidedBy
     reason: str | None = None
     exchange: Exchange | None = None
+
+    def recorded(self) -> dict[str, Any]:
+        """The fields of a ``Decision`` that come from the choice and from the edge's answer."""
+        own = {"sensor_id": self.sensor, "velocity": self.velocity, "source": self.source, "reason": self.reason}
+        return own | exchange_fields(self.exchange)
 
 
 class Pilot(Protocol):

@@ -1,7 +1,7 @@
 """A UAV's observation of the world, its request to the edge, and the result of a step of the fleet."""
 
 from dataclasses import dataclass
-from typing import Literal, TypedDict
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,26 +68,20 @@ def decide_request(
         pydantic.ValidationError: the observation breaks a bound of the wire.
     """
     heard = observation["last_heard"].tolist()
-    positions = observation["sensor_position"]
+    x, y = observation["sensor_position"].T.tolist()
 
     def column(values: FloatArray) -> list[float | None]:
         return [value if step >= 0 else None for value, step in zip(values.tolist(), heard, strict=True)]
 
+    columns: dict[str, Any] = {name: column(observation[name]) for name in ("queue", "battery", "channel_gain")}
+    seen = [step if step >= 0 else None for step in heard]
     return DecideRequest(
         mission_id=mission_id,
         uav_id=uav,
         step=int(observation["step"][0]),
         position=observation["position"].tolist(),
         progress_m=float(observation["progress"][0]),
-        sensors=SensorColumns(
-            id=list(range(len(heard))),
-            x=positions[:, 0].tolist(),
-            y=positions[:, 1].tolist(),
-            queue=column(observation["queue"]),
-            battery=column(observation["battery"]),
-            channel_gain=column(observation["channel_gain"]),
-            last_seen=[step if step >= 0 else None for step in heard],
-        ),
+        sensors=SensorColumns(id=[*range(len(heard))], x=x, y=y, **columns, last_seen=seen),
         outcome=outcome,
         deadline_ms=deadline_ms,
     )

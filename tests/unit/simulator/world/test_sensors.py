@@ -1,4 +1,4 @@
-"""Arrivals in bursts."""
+"""Arrivals in bursts, and noise by instant."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shared.world.scenario import Scenario
-from simulator.world.sensors import Sensors, Streams, draw_bursts
+from simulator.world.sensors import Sensors, StepNoise, Streams, draw_bursts
 
 BURSTY = Scenario(name="bursty", sensors=100, steps=4000, burst_factor=6.0, burst_steps=4.0, calm_steps=12.0)
 
@@ -37,3 +37,12 @@ def test_arrivals_follow_the_bursts_and_keep_each_sensors_mean() -> None:
     np.testing.assert_array_equal(bursty.rates, steady.rates)
     assert bursty.arrivals.mean() == pytest.approx(steady.arrivals.mean(), rel=0.03)
     assert bursty.arrivals.var(axis=0).mean() > 2 * steady.arrivals.var(axis=0).mean()
+
+
+def test_many_worlds_noise_is_each_worlds_own() -> None:
+    small = [0, 1, 2**32 - 1, 2**32, 2**63 - 1]
+    keys = np.concatenate([np.random.default_rng(3).integers(2**63, size=70), small])
+    for instant in (0, 1, 29):
+        alone = [np.random.default_rng([key, instant]).standard_normal((3, 2)) for key in keys.tolist()]
+        np.testing.assert_array_equal(StepNoise(keys).normal(instant, (3, 2)), alone)
+        np.testing.assert_array_equal(StepNoise(keys[-5:]).normal(instant, (3, 2)), alone[-5:])
