@@ -31,10 +31,10 @@ _GOOD_SHARE = 0.7
 # Between two places of the way after the horizon, as a sum of velocities.
 _STRIDE = 4
 # In larger fleets a plan covers only the UAVs that need a decision and fewer steps; the other UAVs keep their plans.
-_JOINT_UAVS = 4
-_NEAR_HORIZON = 4
-_MOST_SENSORS = 40
-_NEAR_SENSORS = 16
+_JOINT_UAVS, _NEAR_HORIZON = 12, 4
+# Up to so many UAVs, and the most sensors of a plan: of these UAVs, of more, and of those that need a decision alone.
+# With more sensors the same search finds worse plans.
+_FEW_UAVS, _MOST_SENSORS = 4, (40, 30, 16)
 # A plan that is expected to lose fewer packets is not improved: no search could save more. Of the plans in scenario
 # `paper` a third are such. With 0.05 two thirds are, but where arrivals come in bursts the expectation is too low, and
 # such plans lost many packets.
@@ -43,9 +43,10 @@ _NEGLIGIBLE = 0.003
 
 # By run of the search: from the better start (0) or the worse one, and its first temperature as a share of their loss.
 RUNS = [(start, heat) for heat in (0.05, 0.15, 0.05) for start in (0, 1)]
-# Packets: the least first temperature; the expected loss after the first run from which more runs are worth it; and the
-# better start's expected loss from which all runs start together.
-_LEAST_HEAT, _WORTH_RUNS, _WORTH_AT_ONCE = 0.02, 0.1, 1.0
+# Packets: the least first temperature, and the highest of more than a few UAVs, since a change concerns a small part of
+# their loss; the expected loss after the first run from which more runs are worth it, and the better start's from which
+# all runs start together.
+_LEAST_HEAT, _MOST_HEAT, _WORTH_RUNS, _WORTH_AT_ONCE = 0.02, 0.3, 0.1, 1.0
 
 # The index of a place that does not exist.
 _NOWHERE = 10**9
@@ -116,6 +117,7 @@ class Draft:
         def run(number: int) -> Found:
             start, heat = RUNS[number]
             hot = max(heat * starts[0].expected_loss, _LEAST_HEAT)
+            hot = hot if len(self.uavs) <= _FEW_UAVS else min(hot, _MOST_HEAT)
             return annealing.search(starts[start].actions, hot, number, until)
 
         best, left = starts[0], range(len(RUNS))
@@ -137,7 +139,7 @@ class RecedingHorizon:
     The objective is the expected number of packets lost in those steps and, without further visits, in at least four
     more: as many as the nearest UAV then needs to the sensor, at full speed; see
     :class:`~shared.planning.queue_chains.QueueChains`. A plan covers all UAVs that are present; the decisions already
-    made in this step are fixed. In fleets of more than four UAVs, a plan covers four steps of the UAVs that need a
+    made in this step are fixed. In fleets of more than twelve UAVs, a plan covers four steps of the UAVs that need a
     decision, and exactly four steps after it count.
 
     Simulated annealing (:class:`~shared.planning.annealing.Annealing`) searches in several runs, from the last plan and
@@ -269,7 +271,7 @@ class RecedingHorizon:
             # The operator's sensors come before those that fill first.
             room = np.where(np.isfinite(self.guidance.visit_intervals(world.sensors)), -1.0, room)
         order = np.lexsort((room, ~near, ~ahead))
-        return np.sort(order[: min(int(ahead.sum()), _MOST_SENSORS if self._joint else _NEAR_SENSORS)])
+        return np.sort(order[: min(int(ahead.sum()), _MOST_SENSORS[(world.uavs > _FEW_UAVS) + (not self._joint)])])
 
     def _within_radio(self, uavs: list[int], sums: ArrayLike) -> NDArray[np.bool_]:
         """The sensors in radio range of one of these UAVs after velocities that sum to one of ``(n,)``."""
