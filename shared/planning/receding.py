@@ -31,7 +31,7 @@ _GOOD_SHARE = 0.7
 # Between two places of the way after the horizon, as a sum of velocities.
 _STRIDE = 4
 # In larger fleets a plan covers only the UAVs that need a decision and fewer steps; the other UAVs keep their plans.
-_JOINT_UAVS, _NEAR_HORIZON = 12, 4
+JOINT_UAVS, _NEAR_HORIZON = 12, 4
 # Up to so many UAVs, and the most sensors of a plan: of these UAVs, of more, and of those that need a decision alone.
 # With more sensors the same search finds worse plans.
 _FEW_UAVS, _MOST_SENSORS = 4, (40, 30, 16)
@@ -158,7 +158,7 @@ class RecedingHorizon:
         self.guidance: Guidance = NO_GUIDANCE
         self.step = -1
         self.plans: dict[int, IntArray] = {}
-        self._joint = scenario.uavs <= _JOINT_UAVS
+        self._joint = scenario.uavs <= JOINT_UAVS
 
     def begin(self, step: int) -> None:
         """Go to a later step: drop the plans' flown steps. The belief advances separately."""
