@@ -11,11 +11,13 @@
 
 Each is a shorter run of another benchmark of this package, which explains itself with --help and measures more. It
 prints the tables and the goals, and writes them as JSON. With --page it also writes them into that page, between the
-lines `<!-- five tables -->` and `<!-- end of the five tables -->`.
+lines `<!-- five tables -->` and `<!-- end of the five tables -->`, and their numbers with the commit into
+`data/five-tables.csv` beside it.
 """
 
 from __future__ import annotations
 
+import csv
 import re
 import tempfile
 import time
@@ -26,6 +28,7 @@ from typing import Any
 
 from benchmarks import capacity, fleet, llm, overhead, sensors, startup
 from benchmarks.harness import Cell, Goal, Options, Report, Rows, run, shown
+from lab.experiments.execution import commit
 
 LONGEST_S = 600.0
 _BEGIN, _END = "<!-- five tables -->", "<!-- end of the five tables -->"
@@ -156,7 +159,7 @@ def markdown(tables: Mapping[str, Rows]) -> str:
 
 
 def write(page: Path, tables: Mapping[str, Rows]) -> None:
-    """Write the tables into a page.
+    """Write the tables into a page, and their numbers into a CSV beside it: an interval is its middle, low and high.
 
     Raises:
         ValueError: the page has no place for them.
@@ -167,6 +170,16 @@ def write(page: Path, tables: Mapping[str, Rows]) -> None:
         raise ValueError(f"{page} has no lines {_BEGIN} and {_END}")
     made = f"{_BEGIN}\n{markdown(tables)}\n{_END}"
     page.write_text(place.sub(lambda _: made, text), encoding="utf-8")
+    data = page.parent / "data" / "five-tables.csv"
+    data.parent.mkdir(exist_ok=True)
+    with data.open("w", newline="", encoding="utf-8") as file:
+        sheet = csv.writer(file, lineterminator="\n")
+        sheet.writerow(("table", "row", "column", "value", "low", "high", "commit"))
+        for title, rows in tables.items():
+            for name, row in rows.items():
+                for column, cell in row.items():
+                    numbers = [cell, "", ""] if isinstance(cell, str | int | float) else cell
+                    sheet.writerow((title, name, column, *numbers, commit()))
 
 
 if __name__ == "__main__":

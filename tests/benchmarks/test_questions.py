@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.harness import Rows
 from benchmarks.questions import write
+from lab.experiments.execution import commit
 from tests.support.places import ROOT
 
 pytestmark = pytest.mark.long
@@ -28,6 +29,11 @@ def test_the_tables_replace_those_of_the_page_and_nothing_else(tmp_path: Path) -
         )
         assert "| a row | 1.5 | 0.5 [0.4, 0.61] |\n| another |  | 1,234 |\n" in text
         assert text.endswith("<!-- end of the five tables -->\n\nAfter.\n") and "old" not in text
+        numbers = (tmp_path / "data" / "five-tables.csv").read_text().splitlines()
+        assert numbers[1:3] == [
+            f"1. What is asked,a row,ms,1.5,,,{commit() or ''}",
+            f"1. What is asked,a row,ratio,0.5,0.4,0.61,{commit() or ''}",
+        ]
 
 
 def test_a_page_without_a_place_for_the_tables_is_refused(tmp_path: Path) -> None:
