@@ -229,7 +229,8 @@ def test_the_constraints_of_the_bound_lose_what_the_rule_loses(seed: int, sensor
             formulation.model.add(literal == 0)
     solver = cp_model.CpSolver()
     assert solver.solve(formulation.model) == cp_model.OPTIMAL
-    assert solver.objective_value == course.lost.sum()
+    # The solver scales the objective: its value is off by the last bits.
+    assert abs(solver.objective_value - course.lost.sum()) < 1e-6
 
 
 @settings(max_examples=40, deadline=None)
