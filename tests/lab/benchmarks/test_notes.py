@@ -33,6 +33,7 @@ def test_the_rules_misread_no_note_and_read_most_but_those_that_mislead(name: st
             # Code refuses what the rules have read.
             continue
         meant = None if row["guidance"] is None else Guidance.model_validate(row["guidance"])
-        # Code may leave out an order that it doubts, in the operator's sight.
-        assert same(guidance, meant) or any(doubt.startswith("In no order") for doubt in doubts), row
+        # Code may leave out an order that it doubts, in the operator's sight; what is left must be meant.
+        left_out = any(doubt.startswith("In no order") for doubt in doubts)
+        assert same(guidance, meant) or (left_out and meant and guidance.values.items() <= meant.values.items()), row
     assert read > (0 if "mislead" in name else 0.65 * len(rows))
