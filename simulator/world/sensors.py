@@ -53,7 +53,7 @@ class _Seed(ISeedSequence):
 def seeded(keys: IntArray, instant: int) -> NDArray[np.uint64]:
     """``numpy.random.SeedSequence([key, instant]).generate_state(4, numpy.uint64)`` of each key, ``(B, 4)``.
 
-    It is O'Neill's ``seed_seq_fe128`` (www.pcg-random.org, 2015); for 1,024 keys at once it takes a sixtieth of the time.
+    It is O'Neill's ``seed_seq_fe128`` (www.pcg-random.org, 2015); for 1,024 keys it takes a sixtieth of the time.
     """
     low, high = keys.view(np.uint32).reshape(-1, 2).T
     # A key below 2^32 is one word, not two.
