@@ -39,7 +39,7 @@ class IdempotentAnswers:
     """
 
     def __init__(self, most: int) -> None:
-        # By key: the digest of the request, the decisions in the answer, and its body in a quarter to half of the bytes.
+        # By key: the digest of the request, the number of decisions, and the body in a quarter to half of its bytes.
         self._answers = BoundedDict[str, tuple[str, int, bytes]](most, itemgetter(1))
         self._in_progress: dict[str, tuple[str, asyncio.Future[str]]] = {}
 
