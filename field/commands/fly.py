@@ -157,18 +157,14 @@ def job_from_options(options: Fly) -> FieldJob:
     return FieldJob(
         site=site,
         radio=radio_named(options.radio, site, options.seed),
-        mavlink=options.mavlink,
         first_uav=options.uav,
         edge=edge,
         mission_id=mission_id,
         out=out,
         seed=options.seed if options.radio == SIMULATED else None,
-        mode=options.mode,
         deadline_ms=in_time_ms if options.deadline_ms is None else options.deadline_ms,
         patience_s=patience_s,
-        speedup=options.speedup,
-        wait_s=options.wait_s,
-        system_id=options.system_id,
+        **{name: getattr(options, name) for name in ("mavlink", "mode", "speedup", "wait_s", "system_id")},
     )
 
 

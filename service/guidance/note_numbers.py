@@ -1,66 +1,32 @@
 """The numbers of an operator's note, each replaced by a letter: the note as the orders' adapter reads it.
 
 ``Visit sensor 4 every third step`` becomes ``visit sensor K every Bth step``. The adapter answers in letters, so it
-cannot invent a number; only code reads values and units.
+cannot invent a number; only code reads values and units. ``note_numbers.toml`` has their words.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from random import Random
 from types import MappingProxyType
 
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 MOST_NUMBERS = 20
 
-# fmt: off
-CARDINALS = [
-    "zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve",
-    "thirteen", "fourteen", "fifteen", "sixteen", "seventeen", "eighteen", "nineteen", "twenty",
-]
-ORDINALS = [
-    "zeroth", "first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth",
-    "eleventh", "twelfth", "thirteenth", "fourteenth", "fifteenth", "sixteenth", "seventeenth", "eighteenth",
-    "nineteenth", "twentieth",
-]
-_TENS = ["twenty", "thirty", "forty", "fifty", "sixty", "seventy", "eighty", "ninety"]
-# fmt: on
-# These words stay next to their letter: they carry more meaning than a number.
-_FACTORS = {"twice": 2.0, "double": 2.0, "doubly": 2.0, "triple": 3.0, "tripple": 3.0, "thrice": 3.0, "half": 0.5}
-_TELLING = {"zero": 0.0, "one": 1.0, "first": 1.0, "second": 2.0, "other": 2.0, "alternate": 2.0, **_FACTORS}
-
-
-def _any(words: Iterable[str]) -> str:
-    return "|".join(sorted(words, key=len, reverse=True))
-
-
+_TABLE = tomllib.loads(files("service.guidance").joinpath("note_numbers.toml").read_text(encoding="utf-8"))
+CARDINALS, ORDINALS, _TENS = (str(_TABLE["words"][kind]).split() for kind in ("cardinals", "ordinals", "tens"))
+_FACTORS, _UNITS = _TABLE["factors"], _TABLE["units"]
+_TELLING: dict[str, float] = {**_TABLE["telling"], **_FACTORS}
+_KINDS = {"tens": {*_TENS}, "ones": {*CARDINALS[1:10]}}
+_KINDS["word"] = {*CARDINALS, *ORDINALS, *_TENS, *_FACTORS} - {"second", "one"}
+_WORDS = {kind: "|".join(sorted(words, key=lambda word: (-len(word), word))) for kind, words in _KINDS.items()}
 _NUMBER = re.compile(
-    r"(?P<clock>\d{1,2}:\d{2}(?::\d{2})?)"
-    r"|(?P<digits>\d+(?:\.\d+)?)(?P<suffix>(?:st|nd|rd|th)\b)?"
-    r"|(?<!per )(?<!\ba )(?P<second>\bsecond\b)"
-    r"|(?<=every )(?P<alternate>other|alternate)\b"
-    r"|(?<!quick )(?<!that )(?<!this )(?<!last )(?<!another )(?<!other )(?<!new )\bone\b(?! of )"
-    r"|\b(?P<some>(?:a )?(?:couple(?: of)?|dozen))\b"
-    rf"|\b(?P<tens>{_any(_TENS)})[- ](?P<ones>{_any(CARDINALS[1:10])})\b"
-    rf"|\b(?P<word>{_any({*CARDINALS, *ORDINALS, *_TENS, *_FACTORS} - {'second', 'one'})})\b"
-    r"|(?P<one>(?<!s )(?<!m )(?<!half )\ban?(?= (?:minute|hour)\b)|(?:(?<=every )|(?<=each ))(?=(?:minute|hour)\b))"
+    "|".join(re.sub(r"\[(\w+)\]", lambda kind: _WORDS[kind[1]], row) for row in _TABLE["number"]["any"])
 )
-_UNITS = {
-    "km/h": r"km/h|kmh|kph|kilomet(?:re|er)s? (?:per|an) hour",
-    "mph": r"mph|miles (?:per|an) hour",
-    "kn": r"kn|kts?|knots?",
-    "m/s": r"m/s|mps|met(?:re|er)s? (?:per|a) second|met(?:re|er)s?/s(?:econd)?",
-    "s": r"s|secs?|seconds?",
-    "min": r"min|mins|minutes?",
-    "h": r"h|hrs?|hours?",
-    "m": r"m|met(?:re|er)s?",
-    "km": r"km|kilomet(?:re|er)s?",
-    "%": r"%|percent|per cent",
-    "steps": r"(?:time )?steps?|rounds?|ticks?",
-    "m²": r"m²",
-}
 _UNIT = re.compile(
     rf"(?:(?<=half) an?\b)?[ -]?(?:{'|'.join(f'(?P<u{i}>{unit})' for i, unit in enumerate(_UNITS.values()))})(?![\w/])"
 )

@@ -32,11 +32,9 @@ def snapshot(mission: Mission, decisions: list[RecentDecision], watched: Watched
         {
             "edge": edge,
             "mission": {
-                "mission_id": mission.mission_id,
-                "mode": mission.mode,
+                **{name: getattr(mission, name) for name in ("mission_id", "mode", "top_k")},
                 "asks": mission.spec.uses_llm,
                 "planner": mission.planner is not None,
-                "top_k": mission.top_k,
             },
             "scenario": scenario.model_dump(include=_SHOWN),
             "pipeline": scenario.pipeline if scenario.layout != "uniform" else (),

@@ -28,6 +28,9 @@ from simulator.flying.local_edge import edge_in_folder
 from simulator.flying.run import run_mission
 from simulator.records.run_folder import fresh_folder, refuse_old_result
 
+# The options that a job has under the same name.
+_PASSED_ON = ("seed", "note", "uplink", "deadline_ms", "wait_s", "reconnect_s")
+
 
 @dataclass(frozen=True)
 class Simulate(WorldOptions):
@@ -141,23 +144,18 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
             edge, alive = stack.enter_context(edge_in_folder(out, console, with_llm))
         job = Job(
             site=site,
-            seed=options.seed,
             mission_id=mission_id,
             out=out,
             command=command,
             policy=options.policy if own_mode is None else "edge",
             edge=edge,
             mode=own_mode or options.mode,
-            note=options.note,
             named=options.mission is not None,
-            uplink=options.uplink,
-            deadline_ms=options.deadline_ms,
-            wait_s=options.wait_s,
             wait_out=("loading", "unavailable") if options.await_llm == "on" else ("loading",),
-            reconnect_s=options.reconnect_s,
             bound_s=BOUND_S if options.bound else 0.0,
             against=tuple(dict.fromkeys((*BASELINES, *options.against))),
             pace=_pace(options.pace),
+            **{name: getattr(options, name) for name in _PASSED_ON},
         )
         metrics = FlightMetrics(site.scenario.steps)
         with serve_metrics(metrics, options.metrics_host, options.metrics_port) as scrapes:

@@ -55,11 +55,10 @@ class Flight:
         """The facts for ``simulator.records.summary.summarise``."""
         return FlightFacts(
             scenario=self.scenario.name,
-            seed=self.seed,
-            steps=self.scenario.steps,
-            steps_flown=self.steps_flown,
-            uavs=self.scenario.uavs,
-            sensors=self.scenario.sensors,
+            **{name: getattr(self.scenario, name) for name in ("steps", "uavs", "sensors")},
+            **{
+                name: getattr(self, name) for name in ("seed", "steps_flown", "interrupted", "started_at", "duration_s")
+            },
             policy=policy,
             edge=edge,
             uplink=uplink,
@@ -67,9 +66,6 @@ class Flight:
             mode=mode,
             model=next((d.model for d in reversed(self.decisions) if d.model), model),
             deadline_ms=next((d.deadline_ms for d in reversed(self.decisions) if d.deadline_ms), deadline_ms),
-            interrupted=self.interrupted,
-            started_at=self.started_at,
-            duration_s=self.duration_s,
             version=version("aic-vds"),
             command=command,
         )

@@ -195,17 +195,14 @@ def is_late(decision: Decision) -> bool:
 
 
 def _tokens(counts: list[Tokens]) -> TokenSummary:
-    prompt, uncompressed = mean([t.prompt for t in counts]), mean([t.uncompressed for t in counts])
-    state, state_uncompressed = mean([t.state for t in counts]), mean([t.state_uncompressed for t in counts])
+    kinds = ("prompt", "uncompressed", "state", "state_uncompressed")
+    prompt, uncompressed, state, whole = (mean([getattr(t, kind) for t in counts]) for kind in kinds)
     return TokenSummary(
-        prompt_mean=prompt,
-        uncompressed_mean=uncompressed,
+        **dict(zip((f"{kind}_mean" for kind in kinds), (prompt, uncompressed, state, whole), strict=True)),
         saved_pct=_saved_pct(prompt, uncompressed),
         cached_mean=mean([t.cached for t in counts if t.cached is not None]),
         cached_pct=_cached_pct(counts),
-        state_mean=state,
-        state_uncompressed_mean=state_uncompressed,
-        state_saved_pct=_saved_pct(state, state_uncompressed),
+        state_saved_pct=_saved_pct(state, whole),
     )
 
 

@@ -8,10 +8,6 @@ NAMES = {
     "aic_vds": "AIC-VDS",
     "eof": "EOF",
     "wqcs": "WQCS",
-    "longest_queue": "longest queue",
-    "queue_and_channel": "queue and channel",
-    "round_robin": "round robin",
-    "random": "random",
     "max_gain": "maximum channel gain",
     "nearest": "nearest neighbour",
 }
@@ -34,7 +30,7 @@ def deciders_text(summary: Summary) -> str:
 def policy_labels(summary: Summary) -> dict[str, str]:
     """The policies' display names; the edge's includes the sources of its decisions."""
     flown = {"aic_vds": f"AIC-VDS: {deciders_text(summary)}"} if summary.decisions else {}
-    return {**dict(zip(summary.lost_packets, summary.lost_packets, strict=True)), **NAMES, **flown}
+    return {**{name: name.replace("_", " ") for name in summary.lost_packets}, **NAMES, **flown}
 
 
 def llm_notice(summary: Summary) -> str | None:
@@ -86,7 +82,7 @@ def verdict(summary: Summary) -> str:
     name, *others = summary.lost_packets
     if summary.real_uavs is not None:
         return f"The UAVs heard that sensors lost {_packets(summary.lost_packets[name])} in this flight."
-    labels = {**dict(zip(summary.lost_packets, summary.lost_packets, strict=True)), **NAMES}
+    labels = {**{name: name.replace("_", " ") for name in summary.lost_packets}, **NAMES}
     lost, rivals = summary.lost_packets[name], [summary.lost_packets[other] for other in others]
     outcome = f"In this one example {labels[name]} lost {_packets(lost)}"
     if not rivals:

@@ -4,8 +4,10 @@ A trajectory of a world is flown for as long as the mission lasts, so the items 
 """
 
 import math
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 
 from shared.world.scenario import Point
 
@@ -73,19 +75,8 @@ class MissionPath:
 # Begins a landing: the items to the next landing are its approach.
 _LAND_START = 189
 # Commands that leave the path as it is. Any other may change it, such as DO_JUMP_TAG.
-_LEAVES_PATH = {
-    "condition": {112, 114, 115},
-    "speed": {178},
-    "home": {179},
-    "relay or servo": {181, 182, 183, 184},
-    "camera or gimbal": {195, 196, 197, 214, 220, 1000, 1001, 2000, 2001, 2003, 2500, 2501, 2502, 2503}
-    | {*range(200, 207), *range(530, 535)},
-    "geofence switch": {207},
-    "payload": {211, 216, 42600},
-    "autotune, script, auxiliary function or engine": {212, 217, 218, 223},
-    "jump tag": {600},
-    "transition": {3000},
-}
+_TABLE = tomllib.loads(files("simulator.sites.plans").joinpath("mission_commands.toml").read_text(encoding="utf-8"))
+_LEAVES_PATH = {kind: set(commands) for kind, commands in _TABLE["leaves_path"].items()}
 _PASSED_OVER = {"take-off": _STARTS, "landing": _ENDS | {_LAND_START}, "delay": _STAYS} | _LEAVES_PATH
 _HARMLESS = frozenset().union(*_LEAVES_PATH.values())
 # MAV_FRAME numbers of latitudes and longitudes, by what their heights are above.
