@@ -10,11 +10,14 @@ from typing import Any
 from service.config.settings import Settings
 from service.llm.adapter_version import DECISIONS, ORDERS, check_adapter
 from service.llm.model_file import embedded_model
+from shared.kit.memory import release_zeros
 
 # By default llama.cpp uses up to 8 GB of host memory for old prompts.
 _PROMPT_CACHE_MIB = 64
 _ONLY_ERRORS = 1
 _BATCH = 128
+# The least memory for states that is worth giving back, bytes.
+_STATES = 2**25
 
 
 class LoadFailed(RuntimeError):
@@ -85,6 +88,8 @@ class EmbeddedServer:
         except RuntimeError as error:
             files = " with ".join([gguf.name, *(path.name for path in loaded)])
             raise LoadFailed(f"llama.cpp cannot load {files}: {error}") from error
+        # It has written zeros to the states of a whole context, and no request can come yet.
+        release_zeros(_STATES)
         self.base_url = f"{self._server.listening_address}/v1"
         self.bare_model = gguf.stem
         self.model, self.notes_model = (

@@ -49,9 +49,9 @@ def test_the_compilers_code_does_not_stay_in_memory() -> None:
     for line in Path("/proc/self/smaps").read_text(encoding="utf-8").splitlines():
         field, *values = line.split()
         if "-" in field:
-            counts = values[0] == "r-xp" and values[-1].endswith("libllvmlite.so")
+            counts = values[0] in ("r-xp", "r--p") and values[-1].endswith("libllvmlite.so")
         elif counts and field == "Rss:":
             resident_kb += int(values[0])
-    # All of it is 80 MB, and compiling touches 50 MB.
-    assert resident_kb < 10_000
+    # All of it is 100 MB, and compiling touches 70 MB.
+    assert resident_kb < 15_000
     assert FleetBelief(WORLD).channel.transfer(0.0)[1] > 0
