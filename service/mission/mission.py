@@ -29,7 +29,7 @@ from service.mission.events import (
     ignore_event,
 )
 from service.mission.idempotency import IdempotentAnswers
-from service.mission.planner import MissionPlanner, can_plan
+from service.mission.planner import MAX_SENSORS, MAX_UAVS, MissionPlanner
 from service.mission.prompt_fit import PromptFit, template_for
 from service.mission.reports import Reports
 from service.mission.resolved_spec import ResolvedSpec
@@ -107,8 +107,8 @@ class Mission:
         self.measured: dict[int, Measured] = {}
         self.reports = Reports(mission_id, self.scenario, self.belief, self.pending)
         self.readings = Readings(self.scenario, self.belief, self.records)
-        planned = spec.planner == "on" and can_plan(self.scenario)
-        self.planner = MissionPlanner(self.scenario, self.belief) if planned else None
+        small = self.scenario.sensors <= MAX_SENSORS and self.scenario.uavs <= MAX_UAVS
+        self.planner = MissionPlanner(self.scenario, self.belief) if small and spec.planner == "on" else None
         self.guidance = OperatorGuidance(spec.note, self.scenario)
         self.visit_orders = VisitOrders()
         prior = PRIOR if self.planner is not None else PRIOR_UNPLANNED

@@ -8,19 +8,14 @@ from concurrent.futures import Executor
 from shared.belief.fleet_belief import FleetBelief
 from shared.planning.fleet_problem import Found
 from shared.planning.orders import Guidance
-from shared.planning.receding import Draft, RecedingHorizon
+from shared.planning.receding import JOINT_UAVS, Draft, RecedingHorizon
 from shared.world.scenario import Scenario
 
 log = logging.getLogger(__name__)
 
-# For a larger world a plan takes too long to set up. There the LLM-free policy, look-ahead, stands in for the plan.
-MAX_SENSORS = 1000
-MAX_UAVS = 20
-
-
-def can_plan(scenario: Scenario) -> bool:
-    """Whether the fleet is small enough to plan for."""
-    return scenario.sensors <= MAX_SENSORS and scenario.uavs <= MAX_UAVS
+# For a larger world a plan takes too long to set up, and for more UAVs their plans take too long together. There the
+# LLM-free policy, look-ahead, stands in for the plan.
+MAX_SENSORS, MAX_UAVS = 1000, 40
 
 
 class MissionPlanner(RecedingHorizon):
@@ -51,14 +46,20 @@ class MissionPlanner(RecedingHorizon):
         async with self._lock:
             horizon = self.copy()
 
-            def search() -> tuple[Draft, Found] | None:
-                draft = horizon.draft(uavs, reserved)
-                return None if draft is None else (draft, draft.search(max(seconds, 0.01)))
+            def search() -> list[tuple[Draft, Found]]:
+                # Of many UAVs at once, each plan chooses the actions of as many as a plan covers.
+                found = []
+                groups = [list(uavs)[first : first + JOINT_UAVS] for first in range(0, len(uavs), JOINT_UAVS)]
+                for group in groups:
+                    if (draft := horizon.draft(group, reserved)) is not None:
+                        found.append((draft, draft.search(max(seconds / len(groups), 0.01))))
+                        horizon.adopt(*found[-1])
+                return found
 
             try:
                 found = await asyncio.get_running_loop().run_in_executor(executor, search)
             except Exception:
                 log.exception("the planner failed; decisions go on without it")
                 return
-            if found is not None:
-                self.adopt(*found)
+            for draft, best in found:
+                self.adopt(draft, best)

@@ -261,22 +261,23 @@ class Annealing:
         begin(self._tables, current, new)
         return current, new
 
-    def search(self, start: IntArray, hot: float, number: int = 0, until: float = math.inf) -> Found:
-        """The best actions of one run of 5,000 changes, at least as good as its start. Threads may search at a time.
+    def search(self, start: IntArray, hot: float, number: int = 0, until: float = math.inf, times: int = 1) -> Found:
+        """The best actions of one run, at least as good as its start. Threads may search at a time.
 
         Args:
             start: shape ``(H, I, 2)``, beginning with the problem's fixed actions.
             hot: the initial temperature, packets; the final one is 0.01.
             number: of the run, which seeds its changes.
             until: a time of ``time.perf_counter`` at which the run ends; its plan then depends on the machine.
+            times: the run makes so many times 5,000 changes.
         """
-        current, new = self._start(start)
+        (current, new), changes = self._start(start), times * CHANGES
         least, best = float(current.cost.sum()), start.copy()
-        falls = (_COLD / hot) ** (1.0 / CHANGES)
-        for first in range(0, CHANGES, _AT_ONCE):
+        falls = (_COLD / hot) ** (1.0 / changes)
+        for first in range(0, changes, _AT_ONCE):
             if time.perf_counter() > until:
                 break
-            last, seed = min(first + _AT_ONCE, CHANGES), CHANGES * number + first
+            last, seed = min(first + _AT_ONCE, changes), changes * number + first
             least = _anneal(self._tables, current, new, best, least, first, last, hot, falls, seed)
         current, new = self._start(best)
         return Found(best, _settle(self._tables, current, new, best))

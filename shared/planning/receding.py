@@ -30,11 +30,12 @@ _BEYOND = (4, 7, 10, 13)
 _GOOD_SHARE = 0.7
 # Between two places of the way after the horizon, as a sum of velocities.
 _STRIDE = 4
-# In larger fleets a plan covers only the UAVs that need a decision and fewer steps; the other UAVs keep their plans.
-JOINT_UAVS, _NEAR_HORIZON = 12, 4
-# Up to so many UAVs, and the most sensors of a plan: of these UAVs, of more, and of those that need a decision alone.
-# With more sensors the same search finds worse plans.
-_FEW_UAVS, _MOST_SENSORS = 4, (40, 30, 16)
+# The most UAVs whose actions a plan chooses, and how many others it takes into account with their last plans: in both
+# cases the nearest ones.
+JOINT_UAVS, _NEIGHBOURS = 12, 12
+# Up to so many UAVs, and the most sensors of a plan: of these UAVs, of more, and of fleets that a plan does not cover.
+# There so many are in reach of those that need a decision. With more sensors the same search finds worse plans.
+_FEW_UAVS, _MOST_SENSORS, _OWN_SENSORS = 4, (40, 24, 30), 16
 # A plan that is expected to lose fewer packets is not improved: no search could save more. Of the plans in scenario
 # `paper` a third are such. With 0.05 two thirds are, but where arrivals come in bursts the expectation is too low, and
 # such plans lost many packets.
@@ -46,7 +47,7 @@ RUNS = [(start, heat) for heat in (0.05, 0.15, 0.05) for start in (0, 1)]
 # Packets: the least first temperature, and the highest of more than a few UAVs, since a change concerns a small part of
 # their loss; the expected loss after the first run from which more runs are worth it, and the better start's from which
 # all runs start together.
-_LEAST_HEAT, _MOST_HEAT, _WORTH_RUNS, _WORTH_AT_ONCE = 0.02, 0.3, 0.1, 1.0
+_LEAST_HEAT, _MOST_HEAT, _WORTH_RUNS, _WORTH_AT_ONCE = 0.02, 1.0, 0.1, 1.0
 
 # The index of a place that does not exist.
 _NOWHERE = 10**9
@@ -117,8 +118,9 @@ class Draft:
         def run(number: int) -> Found:
             start, heat = RUNS[number]
             hot = max(heat * starts[0].expected_loss, _LEAST_HEAT)
-            hot = hot if len(self.uavs) <= _FEW_UAVS else min(hot, _MOST_HEAT)
-            return annealing.search(starts[start].actions, hot, number, until)
+            if len(self.uavs) <= _FEW_UAVS:
+                return annealing.search(starts[start].actions, hot, number, until)
+            return annealing.search(starts[start].actions, min(hot, _MOST_HEAT), number, until, times=2)
 
         best, left = starts[0], range(len(RUNS))
         if best.expected_loss < _WORTH_AT_ONCE:
@@ -139,8 +141,8 @@ class RecedingHorizon:
     The objective is the expected number of packets lost in those steps and, without further visits, in at least four
     more: as many as the nearest UAV then needs to the sensor, at full speed; see
     :class:`~shared.planning.queue_chains.QueueChains`. A plan covers all UAVs that are present; the decisions already
-    made in this step are fixed. In fleets of more than twelve UAVs, a plan covers four steps of the UAVs that need a
-    decision, and exactly four steps after it count.
+    made in this step are fixed. In fleets of more than twelve UAVs, it covers the twelve that are nearest to those that
+    need a decision; the next twelve keep their plans, which it takes into account.
 
     Simulated annealing (:class:`~shared.planning.annealing.Annealing`) searches in several runs, from the last plan and
     from that of :func:`shared.planning.greedy.look_ahead`, on all usable cores. If both are expected to lose a packet,
@@ -158,7 +160,6 @@ class RecedingHorizon:
         self.guidance: Guidance = NO_GUIDANCE
         self.step = -1
         self.plans: dict[int, IntArray] = {}
-        self._joint = scenario.uavs <= JOINT_UAVS
 
     def begin(self, step: int) -> None:
         """Go to a later step: drop the plans' flown steps. The belief advances separately."""
@@ -188,16 +189,17 @@ class RecedingHorizon:
         for uav, fastest in belief.drift.tops.items():
             if uav in self.plans:
                 self.plans[uav] = np.minimum(self.plans[uav], [world.sensors, fastest])
-        free = [uav for uav in (present if self._joint else uavs) if uav in present]
-        if not set(uavs) & set(free):
+        own = [uav for uav in uavs if uav in present]
+        if not own:
             return None
+        free, present = self._nearest(own, present)
         decided = {uav: action for uav, action in belief.decided(step).items() if uav in present}
         left = world.steps - step
         # A fleet may continue past the scenario's last step.
-        horizon = min(_HORIZON if self._joint else _NEAR_HORIZON, left if left > 0 else _HORIZON)
+        horizon = min(_HORIZON, left if left > 0 else _HORIZON)
         fixed = {u: np.array([action]) for u, action in decided.items()}
         fixed |= {u: self.plans[u][:horizon] for u in present if u not in free and len(self.plans.get(u, ()))}
-        kept = self._worth_planning(free if self._joint else [u for u in uavs if u in present], horizon)
+        kept = self._worth_planning(own, free, horizon)
         index = {int(sensor): k for k, sensor in enumerate(kept)}
         nowhere = len(kept)
 
@@ -208,7 +210,7 @@ class RecedingHorizon:
         usable = np.ones((horizon, nowhere + 1), dtype=np.bool_)
         usable[0, :-1] = ~np.isin(kept, list(set(taken) - {sensor for sensor, _ in decided.values()}))
         links = self._links(present, kept, horizon)
-        ahead = self._chances_ahead(present, kept, horizon) if self._joint else None
+        ahead = self._chances_ahead(present, kept, horizon)
         problem = FleetProblem(
             scenario=world,
             trajectories=[belief.trajectory(u) for u in present],
@@ -217,7 +219,7 @@ class RecedingHorizon:
             fixed={present.index(u): renamed(actions) for u, actions in fixed.items()},
             usable=usable,
             chains=self._chains(kept, horizon, ahead),
-            stages=None if ahead is None else self._stages(ahead, horizon),
+            stages=self._stages(ahead, horizon),
             **links,
             **self._outlook(kept, horizon),
             **self._guided(kept, horizon, free),
@@ -254,16 +256,25 @@ class RecedingHorizon:
             sensor = int(distance.argmin())
         return None if sensor in reserved else Action(sensor, velocity)
 
-    def _worth_planning(self, free: list[int], horizon: int) -> IntArray:
-        """The sensors that these UAVs can reach within the horizon; of too many, those that fill first.
+    def _nearest(self, own: list[int], present: list[int]) -> tuple[list[int], list[int]]:
+        """The UAVs nearest to some that are among them: whose actions a plan chooses, and all that it has."""
+        if len(present) <= JOINT_UAVS:
+            return present, present
+        at = np.array([self._belief.trajectory(uav).at(self._belief.uavs[uav].progress_m or 0.0) for uav in present])
+        away = np.hypot(*(at[:, None] - at[[present.index(uav) for uav in own]]).T).min(axis=0)
+        nearest = [present[place] for place in away.argsort(kind="stable")]
+        free = nearest[: max(JOINT_UAVS, len(own))]
+        return sorted(free), sorted(nearest[: len(free) + _NEIGHBOURS])
 
-        A small fleet's plan also includes sensors in reach during the steps after the horizon that count.
+    def _worth_planning(self, own: list[int], free: list[int], horizon: int) -> IntArray:
+        """The sensors that ``free`` UAVs can reach in the steps that count; of too many, those that fill first.
+
+        In a fleet that a plan does not cover, those come first that their ``own`` UAVs can reach within the horizon.
         """
         belief, world = self._belief, self._scenario
         ends = horizon * world.max_velocity
         near = self._within_radio(free, np.arange(ends + 1))
-        later = np.arange(ends, ends + _BEYOND[-1] * world.max_velocity + 1, _STRIDE) if self._joint else ends
-        ahead = self._within_radio(free, later)
+        ahead = self._within_radio(free, np.arange(ends, ends + _BEYOND[-1] * world.max_velocity + 1, _STRIDE))
         near |= not (near | ahead).any()
         ahead |= near
         room = (world.queue_capacity - belief.queue(self.step)) / np.maximum(belief.arrivals.rate, 1e-9)
@@ -271,7 +282,12 @@ class RecedingHorizon:
             # The operator's sensors come before those that fill first.
             room = np.where(np.isfinite(self.guidance.visit_intervals(world.sensors)), -1.0, room)
         order = np.lexsort((room, ~near, ~ahead))
-        return np.sort(order[: min(int(ahead.sum()), _MOST_SENSORS[(world.uavs > _FEW_UAVS) + (not self._joint)])])
+        if world.uavs > JOINT_UAVS:
+            mine = self._within_radio(own, np.arange(ends + 1))[order]
+            first = order[mine][:_OWN_SENSORS]
+            order = np.append(first, order[~np.isin(order, first)])
+        most = _MOST_SENSORS[(world.uavs > _FEW_UAVS) + (world.uavs > JOINT_UAVS)]
+        return np.sort(order[: min(int(ahead.sum()), most)])
 
     def _within_radio(self, uavs: list[int], sums: ArrayLike) -> NDArray[np.bool_]:
         """The sensors in radio range of one of these UAVs after velocities that sum to one of ``(n,)``."""
@@ -324,7 +340,7 @@ class RecedingHorizon:
         links = [self._belief.links(uav, metres) for uav in present]
         return [(link.hold * (link.packets > 0))[:, kept] for link in links]
 
-    def _chains(self, kept: IntArray, horizon: int, ahead: list[FloatArray] | None) -> QueueChains:
+    def _chains(self, kept: IntArray, horizon: int, ahead: list[FloatArray]) -> QueueChains:
         """The queues' chains of the kept sensors, and of one nowhere without packets."""
         world, belief, step = self._scenario, self._belief, self.step
         arrivals = belief.arrivals
@@ -335,7 +351,7 @@ class RecedingHorizon:
         soon = np.diff(Arrivals.burst_over(np.arange(horizon + 1)), axis=0)
         coming = rate + arrivals.burst(step)[kept] * soon[:, None]
         beyond = np.array(self._beyond(horizon))[:, None]
-        best = np.ones(len(kept)) if ahead is None else np.max(ahead, axis=(0, 1))
+        best = np.max(ahead, axis=(0, 1))
         # The error of the rate is the same in all steps: of n steps it adds n times a step's variance to each.
         spread = coming * dispersion + rate_variance * horizon / 2
         return queue_chains(

@@ -147,3 +147,19 @@ def test_a_batch_is_planned_at_once_from_all_reports(edge: Edge, monkeypatch: py
     assert plans == [[0, 1, 2]]
     assert len({answer["sensor_id"] for answer in answers}) == 3
     assert {answer["reason"] for answer in answers} == {"mode_policy"}
+
+
+def test_of_a_large_batch_each_uav_has_a_plan_of_its_own(edge: Edge) -> None:
+    crowd = SCENARIOS["dense"].model_copy(update={"uavs": 26, "sensors": 120, "steps": 1})
+    client = edge(mode="policy", planner_ms=60_000)
+    client.put("/missions/test", json={"scenario": crowd.model_dump(mode="json")}).raise_for_status()
+    world = PipelineWorld(crowd)
+    observations, _ = world.reset(seed=1000)
+    uavs = []
+    for uav, agent in enumerate(world.agents):
+        state = body(decide_request(uav, observations[agent], "test"))
+        uavs.append({key: value for key, value in state.items() if key not in ("mission_id", "step", "deadline_ms")})
+    batch = {"mission_id": "test", "step": 0, "deadline_ms": 60_000, "uavs": uavs}
+    answers = client.post("/decide/batch", json=batch, timeout=60).json()["decisions"]
+    assert {answer["reason"] for answer in answers} == {"mode_policy"}
+    assert len({answer["sensor_id"] for answer in answers}) == 26

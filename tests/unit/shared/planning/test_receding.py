@@ -11,7 +11,7 @@ from shared.belief.fleet_belief import FleetBelief
 from shared.planning.annealing import Annealing
 from shared.planning.fleet_problem import Found
 from shared.planning.receding import RecedingHorizon
-from shared.world.scenario import scenario_named
+from shared.world.scenario import Scenario, scenario_named
 
 PAPER = scenario_named("paper").model_copy(update={"arrival_rate_min": 0.2, "arrival_rate_max": 0.4})
 SENSORS = np.arange(PAPER.sensors)
@@ -106,3 +106,44 @@ def test_no_plan_flies_faster_than_the_fleets_airframes() -> None:
     horizon._belief.drift.tops = {0: 8, 1: 7, 2: 8}
     assert planned(horizon).actions[:, :, 1].max() == 8
     assert all(actions[:, 1].max() <= 8 for actions in horizon.plans.values())
+
+
+def fleet(uavs: int, spacing_m: float) -> RecedingHorizon:
+    """A planner of UAVs in one line along which sensors lie; UAV i begins ``i`` times the spacing along it."""
+    line = ((0.0, 0.0), (100_000.0, 0.0))
+    world = Scenario(name="line", uavs=uavs, sensors=200, routes=(line,) * uavs, area_m=100_000.0)
+    belief = FleetBelief(world)
+    for uav in range(uavs):
+        belief.locate(uav, 0, [uav * spacing_m, 0.0], uav * spacing_m)
+    places = np.stack((np.linspace(0.0, uavs * spacing_m, world.sensors), np.full(world.sensors, 20.0)), axis=1)
+    belief.hear(
+        np.arange(200), places, np.zeros(200, dtype=np.int64), np.full(200, world.queue_capacity), np.full(200, 50.0)
+    )
+    horizon = RecedingHorizon(world, belief)
+    horizon.begin(0)
+    return horizon
+
+
+def test_a_plan_of_up_to_twelve_uavs_chooses_the_actions_of_all() -> None:
+    draft = fleet(12, 300.0).draft([5])
+    assert draft is not None
+    assert draft.free == draft.uavs == list(range(12))
+
+
+def test_in_a_larger_fleet_a_plan_chooses_the_actions_of_the_nearest_and_knows_the_next() -> None:
+    horizon = fleet(40, 300.0)
+    draft = horizon.draft([20])
+    assert draft is not None
+    assert len(draft.free) == 12 and {15, 20, 25} <= set(draft.free) <= set(range(14, 27))
+    assert len(draft.uavs) == 24 and set(draft.free) < set(draft.uavs) <= set(range(8, 33))
+    horizon.adopt(draft, draft.search())
+    assert set(horizon.plans) == set(draft.free)
+    beside = horizon.draft([31])
+    assert beside is not None
+    column = beside.uavs.index(22)
+    assert 22 not in beside.free and len(beside.problem.fixed[column]) == beside.problem.horizon == 8
+
+
+def test_uavs_that_need_a_decision_are_all_in_their_plan() -> None:
+    draft = fleet(20, 300.0).draft([0, 19])
+    assert draft is not None and {0, 1, 18, 19} <= set(draft.free)

@@ -93,20 +93,9 @@ def test_the_smallest_fleets_fly(changes: Any) -> None:
     assert len(flown(SHORT.model_copy(update=changes), 0)) == changes["steps"]
 
 
-def test_a_large_fleet_plans_uav_by_uav() -> None:
+def test_a_fleet_of_more_uavs_than_a_plan_covers_flies() -> None:
     crowd = SCENARIOS["dense"].model_copy(update={"steps": 2, "uavs": 13, "sensors": 60})
     assert sum(sum(collected) for _, collected in flown(crowd, 100)) > 13 * 20
-
-
-def test_a_plan_of_several_uavs_covers_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    shadowed = SCENARIOS["shadowed"].model_copy(update={"steps": 10, "uavs": 5, "sensors": 20})
-
-    def lost() -> int:
-        return sum(lost for lost, _ in flown(shadowed, 701))
-
-    together = lost()
-    monkeypatch.setattr("shared.planning.receding.JOINT_UAVS", 4)
-    assert together < lost()
 
 
 @pytest.mark.long
