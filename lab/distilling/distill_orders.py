@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from itertools import islice
+from itertools import cycle, islice
 
 from rich.console import Console
 
@@ -12,6 +12,7 @@ from lab.distilling.adapter_training import prepared, train_showing
 from lab.distilling.note_examples import note_examples
 from lab.distilling.note_student import NoteStudent, Understanding, understanding
 from lab.distilling.options import DistillOrders
+from lab.distilling.written_notes import WrittenNotes
 from service.config.settings import Settings
 from service.guidance.lettered_orders import STATIC
 from service.llm.adapter_version import ORDERS
@@ -32,7 +33,15 @@ def distill_orders(args: DistillOrders, console: Console) -> None:
     device = prepared(args)
     gguf = embedded_model(Settings())
     args.out.mkdir(parents=True, exist_ok=True)
-    training = list(islice(note_examples(args.seed), args.steps * args.batch))
+    written = WrittenNotes(args.notes)
+    if args.notes:
+        console.print(
+            f"{len(written)} written notes; {len(written.left_out)} are not of this language", highlight=False
+        )
+    kinds = cycle(
+        (note_examples(args.seed), written.examples(args.seed)) if len(written) else (note_examples(args.seed),)
+    )
+    training = [next(next(kinds)) for _ in range(args.steps * args.batch)]
     student = NoteStudent(gguf, STATIC, args.rank, device, args.begin)
     train_showing(student, training, args, console)
     seen, unseen = (
@@ -58,6 +67,7 @@ def _write(student: NoteStudent, seen: Understanding, unseen: Understanding, arg
         "rank": args.rank,
         "learning_rate": args.learning_rate,
         "seed": args.seed,
+        "written_notes": [file.name for file in args.notes],
         "known_phrasings": asdict(seen),
         "held_out_phrasings": asdict(unseen),
     }

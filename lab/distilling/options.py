@@ -79,3 +79,6 @@ class DistillOrders(TrainingOptions):
     """Steps of Adam."""
     batch: int = 16
     """Notes a step."""
+    notes: Annotated[tuple[Path, ...], arg(metavar="FILE")] = ()
+    """Notes that people wrote, as JSON lists of {"note": ..., "guidance": ...}. Half the notes of the training are then
+    of these files, each time with other letters."""
