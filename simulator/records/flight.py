@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from shared.client.calls import Exchange
-from shared.wire.schemas import Uplink
 from shared.world.scenario import Scenario
 from simulator.records.decision import Decision
 from simulator.records.summary import FlightFacts
@@ -40,34 +39,21 @@ class Flight:
         """The number of whole steps flown."""
         return len(self.tally)
 
-    def facts(
-        self,
-        *,
-        policy: str,
-        edge: str | None,
-        uplink: Uplink | None = None,
-        mission_id: str,
-        mode: str | None,
-        model: str | None,
-        deadline_ms: int | None,
-        command: str,
-    ) -> FlightFacts:
-        """The facts for ``simulator.records.summary.summarise``."""
+    def facts(self, **given: Any) -> FlightFacts:
+        """The facts for ``simulator.records.summary.summarise``, and those given, which the flight does not know.
+
+        The model and the deadline are those of its last decision that has one.
+        """
+        for name in ("model", "deadline_ms"):
+            given[name] = next((known for d in reversed(self.decisions) if (known := getattr(d, name))), given[name])
         return FlightFacts(
             scenario=self.scenario.name,
+            version=version("aic-vds"),
             **{name: getattr(self.scenario, name) for name in ("steps", "uavs", "sensors")},
             **{
                 name: getattr(self, name) for name in ("seed", "steps_flown", "interrupted", "started_at", "duration_s")
             },
-            policy=policy,
-            edge=edge,
-            uplink=uplink,
-            mission_id=mission_id,
-            mode=mode,
-            model=next((d.model for d in reversed(self.decisions) if d.model), model),
-            deadline_ms=next((d.deadline_ms for d in reversed(self.decisions) if d.deadline_ms), deadline_ms),
-            version=version("aic-vds"),
-            command=command,
+            **given,
         )
 
 

@@ -27,20 +27,14 @@ BLUE, ORANGE, GREEN, RED, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E
 SKY = "#56B4E9"
 AS_SENT, IN_FULL = (BLUE, "-", "o"), (ORANGE, "--", "s")
 # Colour, dash and marker of each policy, the same on every page.
+# fmt: off
 POLICIES = {
-    "aic_vds": (BLUE, "-", "o"),
-    "eof": (ORANGE, "--", "s"),
-    "wqcs": (GREEN, ":", "^"),
-    "round_robin": (PURPLE, "-.", "D"),
-    "random": (SKY, (0, (5, 1, 1, 1)), "v"),
-    "max_gain": (RED, "--", ">"),
-    "nearest": (GREY, "-.", "X"),
-    "mpc": (INK, "-", "h"),
-    "edge:llm": (BLUE, "--", "P"),
-    "edge:guided": (PURPLE, "-", "P"),
-    "edge:value": (GREEN, "-", "v"),
-    "edge:policy": (RED, "-", "D"),
+    "aic_vds": (BLUE, "-", "o"), "eof": (ORANGE, "--", "s"), "wqcs": (GREEN, ":", "^"),
+    "round_robin": (PURPLE, "-.", "D"), "random": (SKY, (0, (5, 1, 1, 1)), "v"), "max_gain": (RED, "--", ">"),
+    "nearest": (GREY, "-.", "X"), "mpc": (INK, "-", "h"), "edge:llm": (BLUE, "--", "P"),
+    "edge:guided": (PURPLE, "-", "P"), "edge:value": (GREEN, "-", "v"), "edge:policy": (RED, "-", "D"),
 }
+# fmt: on
 OTHER_POLICY = (GREY, "-", "x")
 SOURCES = {"llm": BLUE, "guided": PURPLE, "value": GREEN, "policy": ORANGE, "onboard": RED}
 MARKERS = {"llm": "o", "guided": "P", "value": "^", "policy": "D", "onboard": "o"}
