@@ -80,5 +80,5 @@ class DistillOrders(TrainingOptions):
     batch: int = 16
     """Notes a step."""
     notes: Annotated[tuple[Path, ...], arg(metavar="FILE")] = ()
-    """Notes that people wrote, as JSON lists of {"note": ..., "guidance": ...}. Half the notes of the training are then
-    of these files, each time with other letters."""
+    """Notes that were written one by one, as JSON lists of {"note": ..., "guidance": ...}. Half the notes of a training
+    are then of these files, each time with other letters."""

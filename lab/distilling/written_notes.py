@@ -1,7 +1,7 @@
-"""Operators' notes that people wrote, with their orders in the adapter's language.
+"""Operators' notes that were written one by one, with their orders in the adapter's language.
 
-A file has notes with the guidance that each means. The letters of its orders are found by search: those that mean the
-guidance, and whose numbers stand nearest to each other in the note.
+A file has notes with the guidance that each means; language models wrote ours, in the roles of operators. The letters
+of a note's orders are found by search: those that mean the guidance, and whose numbers stand nearest to each other.
 """
 
 from __future__ import annotations
@@ -40,7 +40,11 @@ class WrittenNotes:
         self.left_out: list[str] = []
         for file in files:
             for row in json.loads(file.read_text(encoding="utf-8")):
-                guidance = NO_GUIDANCE if row["guidance"] is None else Guidance.model_validate(row["guidance"])
+                try:
+                    guidance = NO_GUIDANCE if row["guidance"] is None else Guidance.model_validate(row["guidance"])
+                except ValueError:
+                    self.left_out.append(row["note"])
+                    continue
                 # The adapter reads what the edge's phrases leave of a note.
                 phrased = PhrasedNote(row["note"], _PAPER, {})
                 if phrased.orders or phrased.is_read or orders_of(phrased.text, guidance, 0) is None:
@@ -76,9 +80,10 @@ def orders_of(note: str, guidance: Guidance, seed: int) -> NoteExample | None:
     at = {letter: number.begin for letter, number in lettered.numbers.items()}
     best: tuple[float, list[str]] | None = None
     for chosen in product(*choices):
-        # A number is of one order, but for the sensors of two.
+        # A number is of one order, but for the sensors of two, and the only velocity that is allowed.
         kinds = [(letter, kind) for order in chosen for letter, kind in _used(order)]
-        letters = [letter for letter, kind in kinds if kind != "sensor"]
+        letters = [letter for letter, kind in kinds if kind not in ("sensor", "max")]
+        letters += {letter for letter, kind in kinds if kind == "max"} - {one for one, kind in kinds if kind == "min"}
         others = {letter for letter, kind in kinds if kind == "sensor"}
         if len(set(letters)) < len(letters) or others & set(letters):
             continue

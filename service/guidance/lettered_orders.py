@@ -102,6 +102,8 @@ class _Orders:
         write = writers.get(kind)
         if write is None or (not words and kind not in (MOVE, UNCLEAR)):
             raise BadOrders(f"{order[:80]!r} is no order")
+        if len({*words}) < len(words):
+            raise BadOrders("a number is twice in an order")
         write(words)
 
     def guidance(self) -> Guidance:
@@ -121,8 +123,6 @@ class _Orders:
             return self._wish("visit", words[:-1], 1)
         if len(words) < 3 or words[-2] != "every":
             raise BadOrders("a visit has no period")
-        if words[-1] in words[:-2]:
-            raise BadOrders("a number is both a sensor and a period")
         return self._wish("visit", words[:-2], self._period(words[-1]))
 
     def _ignore(self, words: list[str]) -> None:
@@ -181,6 +181,8 @@ class _Orders:
 
     def _plain(self, letter: str, what: str) -> float:
         number = self._number(letter)
+        if number.unit == "%" and what == "weight":
+            return number.value / 100
         if number.unit is not None:
             raise BadOrders(f"a {what} of {number.value:g} {number.unit}")
         return number.value

@@ -7,7 +7,8 @@ LLM no note is compiled.
 
 An embedded LLM with the orders' adapter reads the note up to three times, each time with other letters for its numbers,
 so that an answer caused by a letter does not recur. A reading that the rules of :mod:`service.guidance.plain_reading`
-share is certain, and ends the search. Else the rules' reading, or without one the LLM's most frequent, has a doubt.
+share is certain, and ends the search. Where the rules read nothing, three equal readings are certain if words confirm
+each order. Else the rules' reading, or without one the LLM's most frequent, has a doubt.
 
 Compiling runs concurrently with decisions, and no decision waits for it. The embedded model answers one request at a
 time and serves decisions first.
@@ -26,7 +27,7 @@ from service.guidance.note_numbers import LetteredNote, numbers_of
 from service.guidance.note_orders import INSTRUCTION, BadOrders, constrain_orders, parse_orders, similar_examples
 from service.guidance.note_phrases import PhrasedNote
 from service.guidance.operator_guidance import OperatorGuidance
-from service.guidance.plain_reading import plain_reading
+from service.guidance.plain_reading import confirms, plain_reading
 from service.llm.answers import NoDecision
 from service.llm.request_bodies import Rewriting
 from service.llm.server_pool import ServerPool
@@ -93,12 +94,16 @@ def _checked(answer: str, note: LetteredNote, scenario: Scenario) -> NoteReading
 
 
 def _most(found: Sequence[NoteReading | BadOrders | Impossible], note: str) -> NoteReading:
-    """The most frequent reading, the first of equal ones, with a doubt; raises the most frequent error."""
+    """The most frequent reading, the first of equal ones, with a doubt unless all agree and words confirm it.
+
+    Raises the most frequent error.
+    """
     texts = [str(one) if isinstance(one, Exception) else one.guidance.model_dump_json() for one in found]
     reading = found[texts.index(Counter(texts).most_common(1)[0][0])]
     if isinstance(reading, Exception):
         raise reading
-    doubt = [_DIFFER.format(note=note)] if len(set(texts)) > 1 else [_ALONE.format(note=note)] * bool(reading.guidance)
+    alone = reading.guidance and not confirms(note, reading.guidance.values)
+    doubt = [_DIFFER.format(note=note)] if len(set(texts)) > 1 else [_ALONE.format(note=note)] * bool(alone)
     return NoteReading(reading.guidance, (*reading.doubts, *doubt), reading.numbers)
 
 

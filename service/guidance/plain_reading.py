@@ -1,12 +1,12 @@
 """A second reading of a note, by rules: each number's part in the orders by the words beside it.
 
 ``plain_reading.toml`` has the words. The rules read nothing rather than guess, and err for other reasons than the LLM:
-where both read the same, the reading is certain.
+where both read the same, the reading is certain. Else words may confirm the LLM's.
 """
 
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 
@@ -16,6 +16,7 @@ from shared.world.scenario import MAX_SENSORS, Scenario
 
 _TABLE = tomllib.loads(files("service.guidance").joinpath("plain_reading.toml").read_text(encoding="utf-8"))
 _WORDS = {kind: re.compile("|".join(patterns)) for kind, patterns in _TABLE["words"].items()}
+_CONFIRMS = {kind: re.compile("|".join(patterns)) for kind, patterns in _TABLE["confirms"].items()}
 _BESIDE = {kind: (re.compile(row["before"]), re.compile(row["after"])) for kind, row in _TABLE["beside"].items()}
 _SPEEDS = {unit: factor for unit, factor in METRES_A_SECOND.items() if unit}
 _LIMITS = {"most": "max_velocity", "least": "min_velocity", "avoided": "avoid:{:g}"}
@@ -38,7 +39,7 @@ class _Part:
 def plain_reading(note: str, scenario: Scenario) -> dict[str, float] | None:
     """Each order's value by its name; None if the rules do not know a number's part, or a word asks for more."""
     text = _WORDS["aside"].sub(lambda found: " " * len(found[0]), note.lower())
-    if _WORDS["more"].search(text):
+    if _WORDS["more"].search(text) or _WORDS["moot"].search(text):
         return None
     whole = [_Part("sensor", [*range(scenario.sensors)], *found.span()) for found in _WORDS["whole"].finditer(text)]
     always = [_Part("visit", [1], *found.span()) for found in _WORDS["always"].finditer(text)]
@@ -55,6 +56,24 @@ def plain_reading(note: str, scenario: Scenario) -> dict[str, float] | None:
         return None
     values = dict(orders)
     return values if values and values.items() >= {*orders} else None
+
+
+def confirms(note: str, orders: Mapping[str, float]) -> bool:
+    """Whether each of the LLM's orders has a word of its kind in a sentence with its number, and none is in doubt."""
+    text = _WORDS["aside"].sub("", note.lower())
+    past = (clause[0] for clause in _WORDS["clause"].finditer(text) if _WORDS["past"].search(clause[0]))
+    if _WORDS["moot"].search(text) or _CONFIRMS["against"].search(note.lower()) or any(map(numbers_of, past)):
+        return False
+    sentences = [part for part in re.split(r"(?<=[.;!?])\s+|\n+", note.lower()) if part.strip()]
+    for name, value in orders.items():
+        kind, _, sensor = name.partition(":")
+        kind = "ignored" if kind == "weight" and not value else "still" if name == "avoid:0" else kind
+        own = float(sensor) if kind in ("visit", "weight", "ignored") else value
+        speeds = ((part, n.value * METRES_A_SECOND.get(n.unit, 1.0)) for part in sentences for n in numbers_of(part))
+        near = [part for part, number in speeds if abs(number - own) < 1.0]
+        if not any(_CONFIRMS[kind].search(part) for part in near or sentences):
+            return False
+    return True
 
 
 def _parts(text: str, step_s: float) -> list[_Part]:

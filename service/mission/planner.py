@@ -13,8 +13,7 @@ from shared.world.scenario import Scenario
 
 log = logging.getLogger(__name__)
 
-# For a larger world a plan takes too long to set up, and for more UAVs their plans take too long together. There the
-# LLM-free policy, look-ahead, stands in for the plan.
+# Of more, plans take too long. There the LLM-free policy, look-ahead, stands in for the plan.
 MAX_SENSORS, MAX_UAVS = 1000, 40
 
 

@@ -9,8 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 # Zeros are looked for in blocks of so many bytes.
-_BLOCK = 2**20
-_ZEROS = bytes(_BLOCK)
+_BLOCK, _ZEROS = 2**20, bytes(2**20)
 
 
 def release_library(name: str) -> None:

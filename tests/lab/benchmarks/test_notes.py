@@ -17,7 +17,7 @@ PAPER = SCENARIOS["paper"]
 
 
 @pytest.mark.parametrize(
-    "name", ["notes.json", "held_out_notes.json", "notes_of_others.json", "notes_that_mislead.json"]
+    "name", ["notes.json", "held_out_notes.json", "notes_of_others.json", "notes_that_mislead.json", "fresh_notes.json"]
 )
 def test_the_rules_misread_no_note_and_read_most_but_those_that_mislead(name: str) -> None:
     read, rows = 0, json.loads(NOTES.with_name(name).read_text(encoding="utf-8"))
@@ -36,4 +36,4 @@ def test_the_rules_misread_no_note_and_read_most_but_those_that_mislead(name: st
         # Code may leave out an order that it doubts, in the operator's sight; what is left must be meant.
         left_out = any(doubt.startswith("In no order") for doubt in doubts)
         assert same(guidance, meant) or (left_out and meant and guidance.values.items() <= meant.values.items()), row
-    assert read > (0 if "mislead" in name else 0.65 * len(rows))
+    assert read > (0.65 * len(rows) if name in ("notes.json", "held_out_notes.json", "notes_of_others.json") else 0)

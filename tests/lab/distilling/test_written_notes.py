@@ -1,4 +1,4 @@
-"""Notes that people wrote become examples: the letters of their orders mean what each note means."""
+"""Written notes become examples: the letters of their orders mean what each note means."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_the_letters_mean_the_note(note: str, meant: dict[str, Any], orders: str
 
 def test_what_no_letter_says_is_left_out(tmp_path: Path) -> None:
     file = tmp_path / "notes.json"
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"note": "Sensor 4 needs a look every 3 steps, somebody.", "guidance": NOTES[0][1]},
         {"note": "Sensor 4 is the one that I like.", "guidance": NOTES[0][1]},
         {"note": "The pump at sensor 8 was loud in the night of 12 May.", "guidance": None},

@@ -12,6 +12,7 @@ from service.guidance.lettered_orders import STATIC
 from service.guidance.note_compiler import compile_note
 from service.guidance.note_orders import BadOrders
 from service.guidance.note_phrases import PhrasedNote
+from service.guidance.plain_reading import confirms, plain_reading
 from service.llm.answers import Completion
 from service.llm.request_bodies import Rewriting
 from service.llm.server_pool import ServerPool
@@ -70,6 +71,45 @@ async def test_a_reading_that_no_rule_confirms_has_a_doubt() -> None:
     found = await reading(Adapted([RIGHT] * 3), UNRULY)
     assert found.guidance == MEANT
     assert found.doubts == (f"No rule confirms the LLM's reading of “{UNRULY}”: compare the orders with it.",)
+
+
+WORDY = "My dear, sensor 4 deserves a look in any 3 steps if I may say so, and 9 m/s would be my ceiling."
+
+
+async def test_where_the_rules_read_nothing_equal_readings_that_words_confirm_have_no_doubt() -> None:
+    assert plain_reading(WORDY, PAPER) is None
+    found = await reading(Adapted([RIGHT] * 3), WORDY)
+    assert (found.guidance, found.doubts) == (MEANT, ())
+    assert (await reading(Adapted([OTHER] * 3), WORDY)).doubts
+    assert (await reading(Adapted([RIGHT, RIGHT, OTHER]), WORDY)).doubts
+
+
+@pytest.mark.parametrize(
+    ("note", "orders", "confirmed"),
+    [
+        ("Sensor 4 wants a visit in 3 steps. The limit is 9.", {"visit:4": 3, "max_velocity": 9}, True),
+        ("Sensor 4, 3. The limit is 9.", {"visit:4": 3, "max_velocity": 9}, False),
+        ("9 m/s resonates with the gimbal. It is struck from the list.", {"min_velocity": 9}, False),
+        ("Never fly at 9 m/s.", {"avoid:9": 9}, True),
+        ("Hover nowhere.", {"avoid:0": 0}, True),
+        ("Sensor 4 is nice.", {"weight:4": 0.0}, False),
+        ("Sensor 4 is dead.", {"weight:4": 0.0}, True),
+        ("What sensor 4 loses counts double.", {"weight:4": 2.0}, True),
+        ("Up to 36 km/h.", {"max_velocity": 10}, True),
+    ],
+)
+def test_a_word_of_its_kind_in_its_sentence_confirms_an_order(
+    note: str, orders: dict[str, float], confirmed: bool
+) -> None:
+    assert confirms(note, orders) == confirmed
+
+
+@pytest.mark.parametrize(
+    ("often", "seconds"),
+    [("twice a minute", "30 seconds"), ("three times an hour", "20 minutes"), ("10 times per hour", "6 minutes")],
+)
+def test_how_often_in_a_time_is_the_time_between(often: str, seconds: str) -> None:
+    assert PhrasedNote(f"I want sensor 4 {often} at least.", PAPER, ()).text.endswith(f"every {seconds} at least.")
 
 
 @pytest.mark.parametrize("answer", [OTHER, "unclear"])
