@@ -23,8 +23,8 @@ def release_library(name: str) -> None:
 def release_zeros(least: int) -> None:
     """Give back zeros of which at least so many bytes follow each other: Linux makes them again when needed.
 
-    No other thread may write to such memory meanwhile. Its first and last megabyte stay, because the zeros at its ends
-    may be others', and each megabyte is looked at again just before it is given back.
+    No other thread may write to such memory or unmap it meanwhile. Its first and last megabyte stay, because the zeros
+    at its ends may be others', and each megabyte is looked at again just before it is given back.
     """
     with suppress(OSError, AttributeError), Path("/proc/self/mem").open("rb", buffering=0) as memory:
         for first, end, entry in _mappings():
