@@ -24,6 +24,17 @@ def body(request: Any) -> dict[str, Any]:
     return dict(request.model_dump(mode="json", exclude_none=True))
 
 
+def batch_of(scenario: Scenario) -> dict[str, Any]:
+    """The reports of all UAVs at step 0."""
+    world = PipelineWorld(scenario)
+    observations, _ = world.reset(seed=1000)
+    uavs = []
+    for uav, agent in enumerate(world.agents):
+        state = body(decide_request(uav, observations[agent], "test"))
+        uavs.append({key: value for key, value in state.items() if key not in ("mission_id", "step", "deadline_ms")})
+    return {"mission_id": "test", "step": 0, "deadline_ms": 60_000, "uavs": uavs}
+
+
 def flown_by_edge(client: httpx.Client, scenario: Scenario, seed: int) -> list[list[tuple[int, int]]]:
     world = PipelineWorld(scenario)
     observations, _ = world.reset(seed=seed)
@@ -135,31 +146,26 @@ def test_a_batch_is_planned_at_once_from_all_reports(edge: Edge, monkeypatch: py
     monkeypatch.setattr(planner.MissionPlanner, "plan", counted)
     client = edge(mode="policy", planner_ms=60_000)
     client.put("/missions/test", json={"scenario": SHORT.model_dump(mode="json")})
-    world = PipelineWorld(SHORT)
-    observations, _ = world.reset(seed=1000)
-    uavs = []
-    for uav, agent in enumerate(world.agents):
-        state = body(decide_request(uav, observations[agent], "test"))
-        uavs.append({key: value for key, value in state.items() if key not in ("mission_id", "step", "deadline_ms")})
     # A plan that takes longer than the first UAV's share of the time would be made again without it.
-    batch = {"mission_id": "test", "step": 0, "deadline_ms": 60_000, "uavs": uavs}
-    answers = client.post("/decide/batch", json=batch, timeout=60).json()["decisions"]
+    answers = client.post("/decide/batch", json=batch_of(SHORT), timeout=60).json()["decisions"]
     assert plans == [[0, 1, 2]]
     assert len({answer["sensor_id"] for answer in answers}) == 3
     assert {answer["reason"] for answer in answers} == {"mode_policy"}
 
 
-def test_of_a_large_batch_each_uav_has_a_plan_of_its_own(edge: Edge) -> None:
+def test_a_large_batch_is_planned_in_groups(edge: Edge, monkeypatch: pytest.MonkeyPatch) -> None:
+    groups = []
+    real = planner.MissionPlanner.draft
+
+    def noted(self: planner.MissionPlanner, uavs: Any, taken: Any = ()) -> Any:
+        groups.append(list(uavs))
+        return real(self, uavs, taken)
+
+    monkeypatch.setattr(planner.MissionPlanner, "draft", noted)
     crowd = SCENARIOS["dense"].model_copy(update={"uavs": 26, "sensors": 120, "steps": 1})
     client = edge(mode="policy", planner_ms=60_000)
     client.put("/missions/test", json={"scenario": crowd.model_dump(mode="json")}).raise_for_status()
-    world = PipelineWorld(crowd)
-    observations, _ = world.reset(seed=1000)
-    uavs = []
-    for uav, agent in enumerate(world.agents):
-        state = body(decide_request(uav, observations[agent], "test"))
-        uavs.append({key: value for key, value in state.items() if key not in ("mission_id", "step", "deadline_ms")})
-    batch = {"mission_id": "test", "step": 0, "deadline_ms": 60_000, "uavs": uavs}
-    answers = client.post("/decide/batch", json=batch, timeout=60).json()["decisions"]
+    answers = client.post("/decide/batch", json=batch_of(crowd), timeout=60).json()["decisions"]
+    assert groups == [list(range(12)), list(range(12, 24)), [24, 25]]
     assert {answer["reason"] for answer in answers} == {"mode_policy"}
     assert len({answer["sensor_id"] for answer in answers}) == 26
