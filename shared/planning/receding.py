@@ -197,8 +197,8 @@ class RecedingHorizon:
         left = world.steps - step
         # A fleet may continue past the scenario's last step.
         horizon = min(_HORIZON, left if left > 0 else _HORIZON)
-        fixed = {u: np.array([action]) for u, action in decided.items()}
-        fixed |= {u: self.plans[u][:horizon] for u in present if u not in free and len(self.plans.get(u, ()))}
+        fixed = {u: self.plans[u][:horizon] for u in present if u not in free and len(self.plans.get(u, ()))}
+        fixed |= {u: np.array([action, *fixed.get(u, ())[1:]]) for u, action in decided.items()}
         kept = self._worth_planning(own, free, horizon)
         index = {int(sensor): k for k, sensor in enumerate(kept)}
         nowhere = len(kept)

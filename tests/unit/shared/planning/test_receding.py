@@ -142,6 +142,12 @@ def test_in_a_larger_fleet_a_plan_chooses_the_actions_of_the_nearest_and_knows_t
     assert beside is not None
     column = beside.uavs.index(22)
     assert 22 not in beside.free and len(beside.problem.fixed[column]) == beside.problem.horizon == 8
+    # What a neighbour has decided counts, not what it had planned for this step.
+    planned = beside.problem.fixed[column].tolist()
+    horizon._belief.record_decision(22, 0, int(beside.kept[0]), 3)
+    decided = horizon.draft([31])
+    assert decided is not None
+    assert decided.problem.fixed[column].tolist() == [[0, 3], *planned[1:]]
 
 
 def test_uavs_that_need_a_decision_are_all_in_their_plan() -> None:
