@@ -116,7 +116,7 @@ class PhrasedNote:
         refused = self._refused({name: value for name, value in read.values.items() if name not in own.values})
         values = {**{n: v for n, v in read.values.items() if n not in refused}, **own.values, **self._once}
         if refused and not values and not self.withdrawn:
-            raise BadOrders(f"“{next(iter(refused.values()))}” may end an order or mean a part of the fleet")
+            raise BadOrders(f"unclear: “{next(iter(refused.values()))}” may end an order or mean a part of the fleet")
         if self._quoted and not values and not self.withdrawn:
             raise BadOrders(f"“{self._quoted[0]}” asks or has a condition, which is no order")
         ends = {name: end for name, end in read.ends.items() if name in values}

@@ -202,6 +202,7 @@ def test_a_doubt_quotes_what_is_in_no_order(note: str, doubts: list[str]) -> Non
         ("Keep everybody to 36 km/h tops.", {"min_velocity": 10}),
         ("2 got a new battery, so stop ignoring it.", {"weight:2": 0}),
         ("Leave 6, 7 and 8 on the schedule they have.", {"avoid:6": 6, "avoid:7": 7, "avoid:8": 8}),
+        ("Never visit sensor 4 every 3 steps.", {"visit:4": 3}),
     ],
 )
 def test_an_order_that_the_words_may_end_is_refused(note: str, read: dict[str, float]) -> None:
