@@ -30,7 +30,7 @@ def deciders_text(summary: Summary) -> str:
 def policy_labels(summary: Summary) -> dict[str, str]:
     """The policies' display names; the edge's includes the sources of its decisions."""
     flown = {"aic_vds": f"AIC-VDS: {deciders_text(summary)}"} if summary.decisions else {}
-    return {**{name: name.replace("_", " ") for name in summary.lost_packets}, **NAMES, **flown}
+    return {**{n: n if ":" in n else n.replace("_", " ") for n in summary.lost_packets}, **NAMES, **flown}
 
 
 def llm_notice(summary: Summary) -> str | None:
@@ -82,7 +82,7 @@ def verdict(summary: Summary) -> str:
     name, *others = summary.lost_packets
     if summary.real_uavs is not None:
         return f"The UAVs heard that sensors lost {_packets(summary.lost_packets[name])} in this flight."
-    labels = {**{name: name.replace("_", " ") for name in summary.lost_packets}, **NAMES}
+    labels = {**{n: n if ":" in n else n.replace("_", " ") for n in summary.lost_packets}, **NAMES}
     lost, rivals = summary.lost_packets[name], [summary.lost_packets[other] for other in others]
     outcome = f"In this one example {labels[name]} lost {_packets(lost)}"
     if not rivals:

@@ -33,7 +33,7 @@ def test_the_rules_misread_no_note_and_read_most_but_those_that_mislead(name: st
             # Code refuses what the rules have read.
             continue
         meant = None if row["guidance"] is None else Guidance.model_validate(row["guidance"])
-        # Code may leave out an order that it doubts, in the operator's sight; what is left must be meant.
+        # Code may leave out a doubtful order and say so. The note must mean the rest.
         left_out = any(doubt.startswith("In no order") for doubt in doubts)
         assert same(guidance, meant) or (left_out and meant and guidance.values.items() <= meant.values.items()), row
     assert read > (0.65 * len(rows) if name in ("notes.json", "held_out_notes.json", "notes_of_others.json") else 0)
