@@ -26,6 +26,7 @@ from simulator.reporting.wording import (
     number,
     orders_text,
     percent,
+    policy_labels,
     verdict,
     world_text,
 )
@@ -51,6 +52,12 @@ def flight() -> Flight:
         for n, d in enumerate(flown.decisions)
     ]
     return flown
+
+
+def test_a_policy_of_ones_own_keeps_its_name(flight: Flight) -> None:
+    lost = {"longest_queue": 1, "my_rules.py:Own_One": 2, "eof": 3}
+    labels = policy_labels(summary_of(flight, None).model_copy(update={"lost_packets": lost}))
+    assert [labels[name] for name in lost] == ["longest queue", "my_rules.py:Own_One", "EOF"]
 
 
 def test_real_uavs_claim_only_what_they_heard(flight: Flight, tmp_path: Path) -> None:
