@@ -1,6 +1,8 @@
 """Scenarios: every number of the world in one validated model, and the presets by name."""
 
 import math
+import tomllib
+from importlib.resources import files
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -243,38 +245,8 @@ class Scenario(Unmodelled):
         return (self.arrival_rate_min + self.arrival_rate_max) / 2
 
 
-SCENARIOS: dict[str, Scenario] = {
-    s.name: s
-    for s in (
-        Scenario(),
-        # Of the settings of the claims map, the one in which most of the paper's statements hold.
-        Scenario(name="paper_light", arrival_rate_min=0.2, arrival_rate_max=0.8, initial_queue_min=0.9, step_s=20.0),
-        Scenario(name="pipeline", layout="pipeline"),
-        Scenario(name="stress", link_share=0.35, arrival_rate_min=4.0, arrival_rate_max=12.0),
-        Scenario(name="dense", sensors=100, uavs=10),
-        Scenario(name="lossy_uplink", uplink_drop=0.1, uplink_jitter_ms=200.0),
-        # 8 dB in all, half of the variance each.
-        Scenario(name="shadowed", shadowing_db=5.66, route_shadowing_db=5.66),
-        Scenario(name="fading", rician_k_db=3.0),
-        Scenario(name="bursty", burst_factor=6.0),
-        Scenario(name="windy", wind_mps=6.0, wind_from_deg=250.0, gust_mps=2.0),
-        Scenario(name="faulty", dead_radios=2, departures=1, link_share_drop=0.5),
-        Scenario(
-            name="field",
-            shadowing_db=3.0,
-            route_shadowing_db=3.0,
-            rician_k_db=10.0,
-            position_noise_m=2.0,
-            burst_factor=3.0,
-            wind_mps=3.0,
-            wind_from_deg=250.0,
-            gust_mps=1.0,
-            dead_radios=1,
-            departures=1,
-            link_share_drop=0.2,
-        ),
-    )
-}
+_PRESETS = tomllib.loads(files("shared.world").joinpath("scenarios.toml").read_text(encoding="utf-8"))
+SCENARIOS: dict[str, Scenario] = {name: Scenario(name=name, **fields) for name, fields in _PRESETS.items()}
 
 
 def scenario_named(name: str) -> Scenario:
