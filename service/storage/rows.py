@@ -19,7 +19,8 @@ from service.mission.events import AdviserReport, Decided, Event, GuidanceChange
 from service.mission.idempotency import Answered
 from service.mission.sensor_readings import PlacedReading
 from service.storage.operations import Change, Checkpoint, Deleted, Entry, Made
-from shared.wire.schemas import Outcome, SensorColumns, UavState
+from shared.wire.schemas import Outcome, UavState
+from shared.wire.sensor_arrays import arrays_of, columns_of
 
 # The newest version in service/storage/migrations/versions.
 SCHEMA = "0005"
@@ -169,9 +170,9 @@ def encode(event: Event) -> tuple[Kind, bytes]:
     match event:
         case Reported(step, uav):
             body: dict[str, Any] = uav.model_dump(include=_REPORT, exclude_defaults=True)
-            # The columns themselves: pydantic would copy each of their numbers.
-            columns = ((name, getattr(uav.sensors, name)) for name in SensorColumns.model_fields)
-            body["sensors"] = {name: column for name, column in columns if column}
+            # Arrays take a tenth of the time of lists.
+            own = arrays_of(uav.sensors)
+            body["arrays"] = [own.ids, own.places.T, np.stack((own.queue, own.battery, own.gain)), own.beacon]
             return "reported", pack([step, body])
         case Decided(decision, attempt, report):
             packed = None if report is None else [report.model, report.advice._asdict()]
@@ -192,6 +193,9 @@ def decode(kind: str, data: bytes) -> Event:
         body = unpack(data)
         match kind:
             case "reported":
+                # Version 0.1.0 stored the columns.
+                if (arrays := body[1].pop("arrays", None)) is not None:
+                    body[1]["sensors"] = columns_of(*arrays)
                 return Reported(body[0], UavState.model_validate(body[1]))
             case "decided":
                 report = None if body[2] is None else AdviserReport(body[2][0], Advice(**body[2][1]))

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import chain
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,3 +52,14 @@ def _arrays(sensors: SensorColumns) -> SensorArrays:
     for array in (ids, places, values, steps):
         array.flags.writeable = False
     return SensorArrays(ids, places, values[0], values[1], values[2], steps)
+
+
+def columns_of(
+    ids: NDArray[np.int64], places: NDArray[np.float64], heard: NDArray[np.float64], beacon: NDArray[np.int64]
+) -> dict[str, list[Any]]:
+    """The columns of n sensors: ``places`` has shape ``(2, n)``, ``heard``, queue, battery and gain, ``(3, n)``."""
+    rows = [row.astype(object) for row in (*heard, beacon)]
+    for row in rows:
+        row[beacon < 0] = None
+    names = ("id", "x", "y", "queue", "battery", "channel_gain", "last_seen")
+    return {name: row.tolist() for name, row in zip(names, (ids, *places, *rows), strict=True)}
