@@ -259,7 +259,7 @@ class Engine:
             # The journal records the answer under its key in the same commit as the decision.
             return _ANSWERS.dump_json(answers).decode()
 
-        text = await mission.idempotent_answers.once(key, request.model_dump_json(), made, mission.record)
+        text = await mission.idempotent_answers.once(key, request, made, mission.record)
         return decisions, answers or _ANSWERS.validate_json(text)
 
     def _follow_up(self, mission: Mission, decisions: list[RecordedDecision], answers: list[DecideResponse]) -> None:

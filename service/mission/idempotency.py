@@ -10,7 +10,10 @@ from zlib import compressobj, decompress
 
 from service.errors import Refused, Unavailable
 from shared.kit.bounded import BoundedDict
+from shared.wire.schemas import BatchRequest, DecideRequest
+from shared.wire.sensor_arrays import arrays_of
 
+AnyRequest = DecideRequest | BatchRequest
 # JSON escapes quotes within a text, so only the field's name matches.
 _DECISION_FIELD = '"decision_id":'
 # Raw deflate with a window of 4 kB.
@@ -19,7 +22,7 @@ _WINDOW = -12
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """The answer to a request under an idempotency key; ``digest`` is the request's SHA-256."""
+    """The answer to a request under an idempotency key, with the request's :func:`digest_of`."""
 
     key: str
     digest: str
@@ -29,6 +32,23 @@ class Answered:
     def decisions(self) -> int:
         """The number of decisions in the answer, at least 1; a batch has one answer for all."""
         return max(1, self.body.count(_DECISION_FIELD))
+
+
+def digest_of(request: AnyRequest) -> str:
+    """A request's SHA-256: of its sensors as arrays, which is faster than as JSON, where they have positions."""
+    uavs = request.uavs if isinstance(request, BatchRequest) else [request]
+    if not all(uav.sensors.x for uav in uavs):
+        return _of_json(request)
+    rows: Any = {"uavs": {"__all__": {"sensors"}}} if isinstance(request, BatchRequest) else {"sensors"}
+    found = hashlib.sha256(request.model_dump_json(exclude=rows).encode())
+    for own in (arrays_of(uav.sensors) for uav in uavs):
+        for array in (own.ids, own.places, own.queue, own.battery, own.gain, own.beacon):
+            found.update(len(array).to_bytes(4, "little") + array.tobytes())
+    return found.hexdigest()
+
+
+def _of_json(request: AnyRequest) -> str:
+    return hashlib.sha256(request.model_dump_json().encode()).hexdigest()
 
 
 class IdempotentAnswers:
@@ -44,21 +64,21 @@ class IdempotentAnswers:
         self._in_progress: dict[str, tuple[str, asyncio.Future[str]]] = {}
 
     async def once(
-        self, key: str, request: str, make: Callable[[], Awaitable[str]], record: Callable[[Answered], None]
+        self, key: str, request: AnyRequest, make: Callable[[], Awaitable[str]], record: Callable[[Answered], None]
     ) -> str:
         """The answer under this key: remembered, in progress, or else made now.
 
         Args:
-            request: the request's canonical text.
             record: receives an answer that is made now.
 
         Raises:
             Refused: the key belongs to another request.
         """
-        digest = hashlib.sha256(request.encode()).hexdigest()
+        digest = digest_of(request)
         in_progress = self._in_progress.get(key)
         known = self._answers.get(key)
-        if (in_progress and in_progress[0] != digest) or (known and known[0] != digest):
+        # Version 0.1.0 stored the digest of the JSON.
+        if (used := in_progress or known) and used[0] not in (digest, _of_json(request)):
             raise Refused("Idempotency-Key", "this key was used for another request of this mission")
         if known is not None:
             return _text(known[2])

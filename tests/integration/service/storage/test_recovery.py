@@ -25,7 +25,7 @@ from service.storage.journal import Journal
 from service.storage.operations import Change, Checkpoint, Done, Entry, WriteFailed, Writer
 from service.storage.rows import pack
 from service.storage.store import Store, StoredMission
-from shared.wire.schemas import MissionSpec, Outcome
+from shared.wire.schemas import DecideRequest, MissionSpec, Outcome
 from shared.world.scenario import Scenario
 from shared.world.step_rule import Action
 from tests.support.missions import attended, uav
@@ -281,8 +281,8 @@ def test_a_lesson_that_fails_leaves_the_mission_readable(tmp_path: Path, monkeyp
     assert mission.learn(sample, 0.5) is None
 
 
-async def test_who_waits_for_a_request_that_is_given_up_is_told_to_send_it_again() -> None:
-    repeats = IdempotentAnswers(8)
+async def test_who_waits_for_a_request_that_is_given_up_is_told_to_send_it_again(report: Report) -> None:
+    repeats, request = IdempotentAnswers(8), DecideRequest.model_validate(report())
     begun = asyncio.Event()
 
     async def never() -> str:
@@ -290,9 +290,9 @@ async def test_who_waits_for_a_request_that_is_given_up_is_told_to_send_it_again
         await asyncio.Event().wait()
         return "never"
 
-    first = asyncio.create_task(repeats.once("k", "request", never, lambda _: None))
+    first = asyncio.create_task(repeats.once("k", request, never, lambda _: None))
     await begun.wait()
-    second = asyncio.create_task(repeats.once("k", "request", never, lambda _: None))
+    second = asyncio.create_task(repeats.once("k", request, never, lambda _: None))
     await asyncio.sleep(0)
     first.cancel()
     with pytest.raises(Unavailable):
@@ -303,9 +303,9 @@ async def test_who_waits_for_a_request_that_is_given_up_is_told_to_send_it_again
     async def answer() -> str:
         return "answer"
 
-    assert await repeats.once("k", "request", answer, lambda _: None) == "answer"
+    assert await repeats.once("k", request, answer, lambda _: None) == "answer"
     with pytest.raises(Refused):
-        await repeats.once("k", "another request", answer, lambda _: None)
+        await repeats.once("k", DecideRequest.model_validate(report(step=1)), answer, lambda _: None)
 
 
 def test_a_key_is_known_longer_than_the_outcome_that_came_with_it(tmp_path: Path, report: Report) -> None:
