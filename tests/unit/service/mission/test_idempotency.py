@@ -12,7 +12,7 @@ from service.errors import Refused
 from service.mission.idempotency import Answered, IdempotentAnswers, digest_of
 from shared.wire.schemas import BatchRequest, DecideRequest
 
-COLUMNS = {
+COLUMNS: dict[str, list[Any]] = {
     "id": [3, 8],
     "x": [10.0, 20.5],
     "y": [0.0, 1.0],
@@ -23,7 +23,7 @@ COLUMNS = {
 }
 
 
-def _request(step: int = 2, **columns: list[Any]) -> DecideRequest:
+def _request(step: int = 2, /, **columns: list[Any]) -> DecideRequest:
     body = {"mission_id": "m", "uav_id": 0, "step": step, "position": [1, 2], "sensors": {**COLUMNS, **columns}}
     return DecideRequest.model_validate(body)
 
@@ -34,9 +34,9 @@ def _batch(*requests: DecideRequest) -> BatchRequest:
 
 
 def test_the_digest_is_the_same_for_the_same_request_only() -> None:
-    different = [
+    different: list[DecideRequest | BatchRequest] = [
         _request(),
-        _request(step=3),
+        _request(3),
         *(_request(**{name: [column[0] + 1, column[1]]}) for name, column in COLUMNS.items()),
         _request(id=[8, 3]),
         _request(queue=[0, 0], battery=[0.0, 0.0], channel_gain=[0.0, 0.0], last_seen=[0, 0]),
@@ -61,4 +61,4 @@ def test_a_key_of_an_earlier_version_belongs_to_its_request(request_: DecideRequ
 
     assert asyncio.run(answers.once("k", request_, never, lambda _: None)) == "[]"
     with pytest.raises(Refused):
-        asyncio.run(answers.once("k", _request(step=9), never, lambda _: None))
+        asyncio.run(answers.once("k", _request(9), never, lambda _: None))
