@@ -23,9 +23,9 @@ from shared.kit.bounded import BoundedDict
 
 log = logging.getLogger(__name__)
 
-# Events between two checkpoints of a mission; replaying them takes 0.2 s, and checkpoints delay less than 1% of the
-# decisions. A decision about many sensors takes longer to replay, and counts for one more event every hundred sensors.
-EVENTS = 1536
+# Events between two checkpoints of a mission: replaying them takes a fraction of a second. A decision about many
+# sensors takes longer to replay, and counts for one more event every hundred sensors.
+EVENTS = 512
 _SENSORS = 100
 # From this number of sensors on, packing a checkpoint takes up to a second.
 _LARGE = 1000
