@@ -66,21 +66,20 @@ def softmax_means(queries: Array, keys: Array, values: Array) -> Array:
 def _means(queries: Array, keys: Array, counted: Array) -> Array:
     """The means of one share's queries, ``(d m,)`` by dimension."""
     work, sums = np.empty(6 * _SHARE, dtype=np.float32), np.empty((2, _SHARE), dtype=np.float32)
-    _sum_up(queries, keys, counted, _KEYS * max(1, len(keys) // _SOME_KEYS), work, sums[0], sums[1])
+    _sum_up(queries, keys, counted, _KEYS * max(1, len(keys) // _SOME_KEYS), work, sums)
     if not (sums[0] < _MOST_WEIGHT).all():
-        _sum_up(queries, keys, counted, _KEYS, work, sums[0], sums[1])
+        _sum_up(queries, keys, counted, _KEYS, work, sums)
     return np.asarray(sums[1] / sums[0])
 
 
 @compiled_fused
-def _sum_up(
-    queries: Array, keys: Array, counted: Array, stride: int, work: Array, weight: Array, weighted: Array
-) -> None:
-    """Write the sums of the weights and of the weighted values.
+def _sum_up(queries: Array, keys: Array, counted: Array, stride: int, work: Array, sums: Array) -> None:
+    """Write the sums of the weights and of the weighted values, ``(2, m)``.
 
-    The largest product is searched in four keys of each ``stride``. ``work`` has the products of four keys, the largest
-    product, which gets weight 1, and zeros.
+    ``work`` gets the products of four keys, the largest product, which is searched in four keys of each ``stride`` and
+    has weight 1, and zeros.
     """
+    weight, weighted = sums[0], sums[1]
     last = keys.shape[1] - _DIMENSIONS
     for i in range(_SHARE):
         work[_LARGEST + i], work[_ZEROS + i], weight[i], weighted[i] = -math.inf, 0.0, 0.0, 0.0

@@ -16,7 +16,6 @@ _R = TypeVar("_R")
 # nogil: other Python threads run meanwhile. _nrt off: functions create no arrays and count no references, which would
 # take most of the time.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
-# Products and sums may be fused.
 _FUSED: dict[str, Any] = {"fastmath": {"contract"}}
 # numba's cache locators: the module's __pycache__, else the user's cache folder.
 _LOCATORS = "shared.kit.compiled_cache.ModuleCacheLocator,UserWideCacheLocator"

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from shared.wire.schemas import SensorColumns
 
+_Numbers = NDArray[np.number[Any]]
 _KEPT = "arrays"
 # Queue, battery, gain and step of a missing beacon.
 _NO_BEACON = np.array([[0.0], [0.0], [0.0], [-1.0]])
@@ -54,9 +55,7 @@ def _arrays(sensors: SensorColumns) -> SensorArrays:
     return SensorArrays(ids, places, values[0], values[1], values[2], steps)
 
 
-def columns_of(
-    ids: NDArray[np.int64], places: NDArray[np.float64], heard: NDArray[np.float64], beacon: NDArray[np.int64]
-) -> dict[str, list[Any]]:
+def columns_of(ids: _Numbers, places: _Numbers, heard: _Numbers, beacon: _Numbers) -> dict[str, list[Any]]:
     """The columns of n sensors: ``places`` has shape ``(2, n)``, ``heard``, queue, battery and gain, ``(3, n)``."""
     rows = [row.astype(object) for row in (*heard, beacon)]
     for row in rows:
