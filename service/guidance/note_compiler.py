@@ -1,17 +1,11 @@
 """Compiling an operator's note: an LLM rewrites it once as orders of a fixed form, and every order is checked here.
 
-The prompt is a conversation with worked examples that resemble the note. Where the server can constrain its answer, it
-is constrained to the orders that the note's numbers allow. The answer is parsed strictly in any case; an answer that
-does not match the note, or that the fleet cannot follow, is refused, and the LLM is asked again a few times. Without an
-LLM no note is compiled.
+Where the server can constrain its answer, it is constrained to the orders that the note's numbers allow; it is parsed
+strictly in any case. An answer that does not match the note, or that the fleet cannot follow, is refused, and the LLM
+is asked again. An embedded LLM with the orders' adapter reads the note up to three times, each time with other letters
+for its numbers, so that an answer caused by a letter does not recur; another LLM gets worked examples that resemble it.
 
-An embedded LLM with the orders' adapter reads the note up to three times, each time with other letters for its numbers,
-so that an answer caused by a letter does not recur. A reading that the rules of :mod:`service.guidance.plain_reading`
-share is certain, and ends the search. Where the rules read nothing, three equal readings are certain if words confirm
-each order. Else the rules' reading, or without one the LLM's most frequent, has a doubt.
-
-Compiling runs concurrently with decisions, and no decision waits for it. The embedded model answers one request at a
-time and serves decisions first.
+No decision waits for a note: the embedded model answers one request at a time and serves decisions first.
 """
 
 import asyncio
@@ -52,7 +46,7 @@ _ALONE = "No rule confirms the LLM's reading of “{note}”: compare the orders
 
 
 async def read_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReading:
-    """The note's reading.
+    """The note's reading: certain if the rules read the same, or if three agree and words confirm each order.
 
     Raises:
         BadOrders: no rule reads the note, and most answers are no orders or find it unclear.

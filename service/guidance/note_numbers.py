@@ -34,12 +34,13 @@ _UNIT = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A number of a note: its value, its unit if one follows, and where it stands in the lowered note."""
+    """A number of a note: its value, its unit if one follows, where it stands in the lowered note, and its form."""
 
     value: float
     unit: str | None
     begin: int
     end: int
+    is_ordinal: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +82,7 @@ def numbers_of(lowered: str) -> list[Number]:
         if (value := _value(match)) is not None:
             unit = _UNIT.match(lowered, match.end())
             named = None if unit is None else list(_UNITS)[int(str(unit.lastgroup)[1:])]
-            found.append(Number(value, named, match.start(), match.end()))
+            found.append(Number(value, named, *match.span(), bool(match["suffix"]) or match["word"] in ORDINALS))
     return found
 
 

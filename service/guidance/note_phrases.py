@@ -78,6 +78,7 @@ class PhrasedNote:
         for row, patterns in _ROWS["order"]:
             plain = self._taken(patterns, lambda match: not self._says("conditional", match))
             self._orders += [(row["means"], match) for match in plain]
+        list(self._taken([_CLAUSE], self._is_chat))
 
     @property
     def orders(self) -> bool:
@@ -189,6 +190,14 @@ class PhrasedNote:
             for match in filter(wanted, pattern.finditer(self.rest)):
                 self.rest = self.rest[: match.start()] + " " * len(match[0]) + self.rest[match.end() :]
                 yield match
+
+    def _is_chat(self, clause: re.Match[str]) -> bool:
+        """Whether a clause only counts what no order is about: it has no word of one, nor a sensor's or a velocity."""
+        most, numbers = max(self._scenario.sensors - 1, self._scenario.max_velocity), numbers_of(clause[0])
+        others = (
+            n.value > most and n.unit in (None, "m", "km") and _has("counted", clause[0][n.begin :]) for n in numbers
+        )
+        return bool(numbers) and not _has("orderly", clause[0]) and all(others)
 
     def _says(self, kind: str, match: re.Match[str]) -> bool:
         """Whether the sentence of a phrase has words of a kind."""

@@ -135,7 +135,8 @@ def _limits(text: str, parts: list[_Part]) -> _Orders:
         if limits == ["avoided"]:
             limits *= len(listed)
         elif len(listed) == 2 and "avoided" not in limits:
-            limits = ["least", "most"]
+            spans = _WORDS["to"].fullmatch(text, listed[0].end, listed[1].begin)
+            limits = ["least", "most"] if spans or _WORDS["between"].search(text, 0, listed[0].begin) else limits
         for limit, part in zip(limits, listed, strict=True):
             whole = int(part.values[0] + ROUNDING)
             if abs(part.values[0] - whole) > ROUNDING:
@@ -154,8 +155,12 @@ def _around(text: str, begin: int, end: int, parts: list[_Part]) -> list[str]:
     last = min([len(text), *(at for at in stops + [part.begin for part in parts] if at >= end)])
     near = max([first, *(at for at, _ in clauses if at <= begin)]), min([last, *(at for _, at in clauses if at >= end)])
     alone = sum(part.kind == "velocity" for part in parts if not begin <= part.begin < end) == 0
-    for place in (near, (first, near[1]), (first, last), *[(0, len(text))] * alone):
+    sentences = zip([0, *stops], [*stops, len(text)], strict=True)
+    apart = [(a, b) for a, b in sentences if alone and not any(a <= part.begin < b for part in parts)]
+    for place in (near, (first, near[1]), (first, last), *apart):
         if found := [limit for limit in _LIMITS if _WORDS[limit].search(text, *place)]:
+            if found == ["avoided"] and _WORDS["relative"].search(text, *place):
+                raise ValueError("a limit, or a velocity that nobody flies")
             return found
     return []
 

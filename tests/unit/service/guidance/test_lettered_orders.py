@@ -141,6 +141,7 @@ def test_what_is_in_no_order_is_a_doubt() -> None:
         ("avoid {5}", "none of the velocities"),
         ("max {6}", "top speed"),
         ("weigh {0} {6}", "weight"),
+        ("weigh {0} {7}", "a weight of 10th"),
         ("visit {0}-{0} every {1}", "are no range"),
         ("max Ω", "is no number of the note"),
         ("go home", "is no order"),
@@ -149,6 +150,6 @@ def test_what_is_in_no_order_is_a_doubt() -> None:
     ],
 )
 def test_what_a_number_cannot_be_is_refused(said: str, why: str) -> None:
-    note = LetteredNote.of("sensor 4, 3 steps, 9 m/s, 7, 2.5, 20 km/h, 60", 0)
+    note = LetteredNote.of("sensor 4, 3 steps, 9 m/s, 7, 2.5, 20 km/h, 60, a mere tenth", 0)
     with pytest.raises((BadOrders, Impossible), match=why):
         meaning(said.format(*note.numbers), note, PAPER)

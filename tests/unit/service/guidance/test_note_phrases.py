@@ -100,6 +100,8 @@ def test_what_a_phrase_might_misread_is_for_the_llm(note: str) -> None:
         ("At least 3 m/s.", "Never fly slower than 3 m/s."),
         ("Don't fly at 5 m/s.", "Never fly at 5 m/s."),
         ("Leave sensor 4 alone.", "Ignore what sensor 4 loses."),
+        ("Please keep moving.", "Never fly at 0 m/s."),
+        ("No hovering, nobody stands still", "Never fly at 0 m/s."),
         ("Someone pop over to 4 once for a reading.", "Visit sensor 4 once, as soon as possible."),
         ("Would be good to know: one of you, please go to sensor 4 once", "Visit sensor 4 once, as soon as possible."),
         ("Somebody check 4 every 3 steps", f"{VISIT}."),

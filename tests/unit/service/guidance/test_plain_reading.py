@@ -32,6 +32,10 @@ PAPER = SCENARIOS["paper"]
         ("Avoid 3 m/s and 11 m/s, both make the gimbal wobble.", {"avoid:3": 3, "avoid:11": 11}),
         ("The rotors sing at 8 m/s, so choose any other speed.", {"avoid:8": 8}),
         ("No hovering, gentlemen.", {"avoid:0": 0}),
+        ("Ban 3 and 14 m/s.", {"avoid:3": 3, "avoid:14": 14}),
+        ("The rotors whine at 7 m/s. Nobody flies at that speed.", {"avoid:7": 7}),
+        ("Sensor 0 at least once per 12 steps, and top out at 11 m/s.", {"visit:0": 12, "max_velocity": 11}),
+        ("Every 7 steps for sensor 6, and 8 gets half weight.", {"visit:6": 7, "weight:8": 0.5}),
     ],
 )
 def test_plain_notes_are_read(note: str, values: dict[str, float]) -> None:
@@ -68,6 +72,16 @@ def test_plain_notes_are_read(note: str, values: dict[str, float]) -> None:
         "Half the sheep drink by sensor 0, so see it every fifteen steps.",
         "Visit sensor 4 twice every 10 steps.",
         "Weight 8 for sensor 3 and 10 for sensor 9.",
+        "Everything between 7 and 9 m/s sounds vulgar; banned!",
+        "Less than 2 m/s is forbidden.",
+        "Nae gaun at 1 m/s nor 2, she wallows.",
+        "The previous shift ran sensor 4 every 3 steps.",
+        "I told the ladies that you visit sensor 5 every minute.",
+        "My colleague proposes 'all sensors each 20 steps'.",
+        "Sensor 6 weight zero rescinded.",
+        "Nice work yesterday, 7 m/s all day.",
+        "Sensors six and seven: the former is dead, the latter gets a visit each 12 steps.",
+        "Negative on sensor 3 every 5 steps.",
         "",
     ],
 )
