@@ -16,7 +16,7 @@ from typing import Any
 
 from lab.distilling.note_examples import NoteExample
 from service.guidance.lettered_orders import ALL, MOVE, NOTHING, SEPARATOR, meaning
-from service.guidance.note_numbers import LetteredNote
+from service.guidance.note_numbers import LetteredNote, Number
 from service.guidance.note_orders import BadOrders
 from service.guidance.note_phrases import PhrasedNote
 from shared.planning.orders import NO_GUIDANCE, Guidance
@@ -97,7 +97,11 @@ def orders_of(note: str, guidance: Guidance, seed: int) -> NoteExample | None:
         read = meaning(answer, lettered, _PAPER)
     except BadOrders:
         return None
-    return NoteExample(note, lettered.text, answer) if read.guidance == guidance else None
+    return (
+        NoteExample(note, lettered.text, answer)
+        if (read.guidance.values, read.guidance.ends) == (guidance.values, {})
+        else None
+    )
 
 
 def _apart(places: Sequence[int]) -> int:
@@ -123,11 +127,11 @@ def _choices(lettered: LetteredNote, guidance: Guidance, lowered: str) -> Iterat
                 groups.setdefault(float(value), []).append(wish.sensor_id)
     for every, sensors in values["visit_every"].items():
         periods = [letter for letter in lettered.numbers if _means(lettered, f"visit {ALL} every {letter}", every)]
-        ends = [f" every {letter}" for letter in periods] or ([" always"] if every == 1 else [])
+        ends = [f" every {letter}" for letter in periods] + [" always"] * (every == 1)
         yield [f"visit {who}{end}" for who in _who(lettered, sensors, lowered) for end in ends]
     for weight, sensors in values["weight"].items():
         who = _who(lettered, sensors, lowered)
-        factors = [one for one, number in lettered.numbers.items() if number.unit is None and number.value == weight]
+        factors = [one for one, number in lettered.numbers.items() if _factor(number) == weight]
         yield [f"ignore {w}" for w in who] if weight == 0 else [f"weigh {w} {one}" for w in who for one in factors]
     for kind, level in (("max", guidance.max_velocity), ("min", guidance.min_velocity)):
         if level is not None:
@@ -154,6 +158,10 @@ def _who(lettered: LetteredNote, sensors: list[int], lowered: str) -> list[str]:
     if not found and sensors == list(range(_PAPER.sensors)) and _ALL.search(lowered):
         found = [ALL]
     return found
+
+
+def _factor(number: Number) -> float | None:
+    return number.value / 100 if number.unit == "%" else None if number.unit else number.value
 
 
 def _read(lettered: LetteredNote, order: str) -> Guidance | None:
