@@ -201,8 +201,8 @@ class PhrasedNote:
 
     def _says(self, kind: str, match: re.Match[str]) -> bool:
         """Whether the sentence of a phrase has words of a kind."""
-        sentence = _STOP.split(self._lowered[: match.start()])[-1] + _STOP.split(self._lowered[match.start() :])[0]
-        return _has(kind, sentence)
+        begin = _STOP.split(self._lowered[: match.start()])[-1]
+        return _has(kind, begin + re.split(r"(?<=[.;!?])(?=\s|$)", self._lowered[match.start() :])[0])
 
     def _withdraws(self, row: Mapping[str, Any], in_force: Collection[str], match: re.Match[str]) -> bool:
         known = not row.get("in_force") or any(matching(in_force, name) for name in _names(row, match))

@@ -27,7 +27,7 @@ class EdgeRefused(EdgeError):
         self.detail = detail = problem.detail
         self.errors = problem.errors
         self.type = problem.type
-        fields = "; ".join(f"{error.field}: {error.problem}" for error in self.errors)
+        fields = "; ".join(f"{error.field}: {error.problem}" for error in self.errors if error.problem not in detail)
         super().__init__(f"{url} refused with {status}: {detail}" + (f" ({fields})" if fields else ""))
 
     def concerns(self, field: str) -> bool:

@@ -72,6 +72,7 @@ def test_what_a_note_withdraws_is_read_whole(note: str, withdrawn: list[str]) ->
     [
         # Without such an order in force it may mean that the sensor does not count.
         "No need to visit sensor 5.",
+        "Fly at most 9 m/s? Never!",
         "Don't cancel all orders.",
         "Cancel all orders at step 40.",
         "Shall we cancel all orders?",
