@@ -44,6 +44,10 @@ from tests.unit.service.guidance.test_note_phrases import phrased
         ("Sensor 4 people like", "Sensor 4 people like"),
         ("The bus is at marker 212 again. Sensor 4 every 3 steps for me", "sensor 4 every 3 steps for me"),
         ("S3 must wait. 40 visitors or more", "S3 must wait. some visitors or more"),
+        # A time, an end and a height stay.
+        ("Sensor 4 every 3 steps, from 1540 on", "Sensor 4 every 3 steps, from 1540 on"),
+        ("Sensor 4 every 3 steps for 3 days", "Sensor 4 every 3 steps for 3 days"),
+        ("Stay above 40 feet", "Stay above 40 feet"),
     ],
 )
 def test_other_spellings_and_slips_are_read_as_usual_words(note: str, read: str) -> None:
