@@ -55,7 +55,7 @@ def plain_reading(note: str, scenario: Scenario) -> dict[str, float] | None:
     except ValueError:
         return None
     values = dict(orders)
-    return values if values and values.items() >= {*orders} else None
+    return values if values and values.items() >= {*orders} and "." not in "".join(values) else None
 
 
 def confirms(note: str, orders: Mapping[str, float]) -> bool:
@@ -136,7 +136,8 @@ def _limits(text: str, parts: list[_Part]) -> _Orders:
             limits *= len(listed)
         elif len(listed) == 2 and "avoided" not in limits:
             spans = _WORDS["to"].fullmatch(text, listed[0].end, listed[1].begin)
-            limits = ["least", "most"] if spans or _WORDS["between"].search(text, 0, listed[0].begin) else limits
+            if spans or _WORDS["between"].search(text, 0, listed[0].begin) or len(limits) == 2:
+                limits = ["least", "most"] if listed[0].values < listed[1].values else ["most", "least"]
         for limit, part in zip(limits, listed, strict=True):
             whole = int(part.values[0] + ROUNDING)
             if abs(part.values[0] - whole) > ROUNDING:

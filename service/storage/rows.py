@@ -188,12 +188,11 @@ def encode(event: Event) -> tuple[Kind, bytes]:
 
 
 def decode(kind: str, data: bytes) -> Event:
-    """The event of a kind and a body; raises ``ValueError`` for damaged or unknown ones."""
+    """The event of a kind and a body, also of version 0.1.0; raises ``ValueError`` for damaged or unknown ones."""
     try:
         body = unpack(data)
         match kind:
             case "reported":
-                # Version 0.1.0 stored the columns.
                 if (arrays := body[1].pop("arrays", None)) is not None:
                     body[1]["sensors"] = columns_of(*arrays)
                 return Reported(body[0], UavState.model_validate(body[1]))

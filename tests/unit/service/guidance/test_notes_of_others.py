@@ -55,6 +55,53 @@ def test_other_spellings_and_slips_are_read_as_usual_words(note: str, read: str)
 
 
 @pytest.mark.parametrize(
+    "note",
+    """\
+UAV 2 motors are hot, keep below 8 m/s.
+Sensor 5 every 3 minutes, wait 2 minutes before the first visit.
+Visit all sensors minus 5 every 4 steps.
+Sensor 4 counts like before, sensor 5 counts double.
+Sensor 3 gets less than its normal weight
+Raise the weight of sensor 3 by a quarter.
+Raise sensors from 3 to 7 to weight 2.
+Shift the weight from 3 to 7.
+Cut speeds from 4 to 6 m/s out.
+Fly up from 4 to 9 m/s.
+Once 3 falls silent ignore it
+Second drone: no hovering.
+The sign at the gate says: no hovering.
+Nice work, keep it moving!
+Visit sensor 3 every 6 and 20 km/h max
+Visit sensor 3 every 1 minute 10 m/s max
+Give sensor one two minutes.
+Visit sensor one four steps at the latest
+Point three every 5 steps.
+Double the weights of 3,5 and 7.""".splitlines(),
+)
+def test_what_may_mean_a_sensor_or_a_range_stays(note: str) -> None:
+    assert (phrased(note).text, phrased(note).orders) == (note, False)
+
+
+@pytest.mark.parametrize(
+    ("note", "doubt"),
+    [
+        ("Visit sensor 3 every 6 steps. Wait 30 seconds there.", "wait 30 seconds there"),
+        ("Visit sensor 3 every 4 steps, ending 1900 local.", "ending 1900 local"),
+        ("Visit sensor 4 every 5 steps. Keep 100 metres off the road.", "keep 100 metres off the road"),
+        ("Visit sensor 3 every 5 steps, take 20 pictures.", "take 20 pictures"),
+        ("Visit sensor 4 every 5 steps, finish in 20 laps.", "finish in 20 laps"),
+    ],
+)
+def test_what_no_order_has_leaves_a_doubt(note: str, doubt: str) -> None:
+    assert phrased(note).completed(NO_GUIDANCE, ())[1] == [f"In no order: “{doubt}”."]
+
+
+def test_a_condition_that_is_a_denial_is_quoted() -> None:
+    with pytest.raises(BadOrders, match="asks or has a condition"):
+        phrased("Visit sensor 3 every 4 steps if it is not dark.").completed(NO_GUIDANCE, ())
+
+
+@pytest.mark.parametrize(
     ("note", "read"),
     [
         ("The valve by sensor 8 was repaired. I want it inspected every half minute.", {"visit:8": 3}),
