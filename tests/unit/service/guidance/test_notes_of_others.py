@@ -76,7 +76,19 @@ Visit sensor 3 every 1 minute 10 m/s max
 Give sensor one two minutes.
 Visit sensor one four steps at the latest
 Point three every 5 steps.
-Double the weights of 3,5 and 7.""".splitlines(),
+Double the weights of 3,5 and 7.
+Sensor 3 is a third more important.
+Sensor 2 lost three quarters of its battery, see it every 4 steps.
+Visit 3 every 2 minutes and 4 every 5 steps, 5 every 6.
+Sensor 3 weighs half, sensor 4 halved again.
+Sensor 3 not back to normal weight yet.
+Move from 3 to 8 m/s at most.
+Sensor 4 every 3 steps. Window 1400-1600.
+Sensor 4 every 3 steps. Wait for the 16th flight.
+Sensor 4 every twenty-two minutes thirty seconds
+Sensor 4 weighs one point two five
+Sensor 3 every 3 steps, data not more than 2 days old
+Limit 25 mph, temperatures below 5.""".splitlines(),
 )
 def test_what_may_mean_a_sensor_or_a_range_stays(note: str) -> None:
     assert (phrased(note).text, phrased(note).orders) == (note, False)
