@@ -118,6 +118,8 @@ class PhrasedNote:
         values = {**{n: v for n, v in read.values.items() if n not in refused}, **own.values, **self._once}
         if refused and not values and not self.withdrawn:
             raise BadOrders(f"unclear: “{next(iter(refused.values()))}” may end an order or mean a part of the fleet")
+        if not values and not self.withdrawn and _has("vague", self.rest):
+            raise BadOrders("the note is unclear: say how fast")
         if self._quoted and not values and not self.withdrawn:
             raise BadOrders(f"“{self._quoted[0]}” asks or has a condition, which is no order")
         ends = {name: end for name, end in read.ends.items() if name in values}

@@ -57,8 +57,6 @@ def _arrays(sensors: SensorColumns) -> SensorArrays:
 
 def columns_of(ids: _Numbers, places: _Numbers, heard: _Numbers, beacon: _Numbers) -> dict[str, list[Any]]:
     """The columns of n sensors: ``places`` has shape ``(2, n)``, ``heard``, queue, battery and gain, ``(3, n)``."""
-    rows = [row.astype(object) for row in (*heard, beacon)]
-    for row in rows:
-        row[beacon < 0] = None
+    rows = [np.where(beacon < 0, np.array(None), row.astype(object)) for row in (*heard, beacon)]
     names = ("id", "x", "y", "queue", "battery", "channel_gain", "last_seen")
     return {name: row.tolist() for name, row in zip(names, (ids, *places, *rows), strict=True)}
