@@ -168,6 +168,8 @@ def write(page: Path, tables: Mapping[str, Rows]) -> None:
     place = re.compile(f"{re.escape(_BEGIN)}\n.*{re.escape(_END)}", re.DOTALL)
     if not place.search(text):
         raise ValueError(f"{page} has no lines {_BEGIN} and {_END}")
+    # Before the page makes the tree differ from it.
+    measured = commit()
     made = f"{_BEGIN}\n{markdown(tables)}\n{_END}"
     page.write_text(place.sub(lambda _: made, text), encoding="utf-8")
     data = page.parent / "data" / "five-tables.csv"
@@ -179,7 +181,7 @@ def write(page: Path, tables: Mapping[str, Rows]) -> None:
             for name, row in rows.items():
                 for column, cell in row.items():
                     numbers = [cell, "", ""] if isinstance(cell, str | int | float) else cell
-                    sheet.writerow((title, name, column, *numbers, commit()))
+                    sheet.writerow((title, name, column, *numbers, measured))
 
 
 if __name__ == "__main__":
