@@ -184,7 +184,7 @@ class _Orders:
         if number.unit == "%" and what == "weight":
             return number.value / 100
         if number.unit is not None or (number.is_ordinal and what == "weight"):
-            raise BadOrders(f"a {what} of {number.value:g}{'th' if number.is_ordinal else f' {number.unit}'}")
+            raise BadOrders(f"a {what} of {number.value:g}{'th' if number.unit is None else f' {number.unit}'}")
         return number.value
 
     def _period(self, letter: str) -> int:
