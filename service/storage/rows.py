@@ -170,8 +170,7 @@ def encode(event: Event) -> tuple[Kind, bytes]:
     match event:
         case Reported(step, uav):
             body: dict[str, Any] = uav.model_dump(include=_REPORT, exclude_defaults=True)
-            # Arrays take a tenth of the time of lists.
-            own = arrays_of(uav.sensors)
+            own = arrays_of(uav.sensors)  # packed in a quarter of the time of lists
             body["arrays"] = [own.ids, own.places.T, np.stack((own.queue, own.battery, own.gain)), own.beacon]
             return "reported", pack([step, body])
         case Decided(decision, attempt, report):

@@ -11,16 +11,7 @@ import pytest
 from service.errors import Refused
 from service.mission.idempotency import Answered, IdempotentAnswers, digest_of
 from shared.wire.schemas import BatchRequest, DecideRequest
-
-COLUMNS: dict[str, list[Any]] = {
-    "id": [3, 8],
-    "x": [10.0, 20.5],
-    "y": [0.0, 1.0],
-    "queue": [4, None],
-    "battery": [50.0, None],
-    "channel_gain": [-80.0, None],
-    "last_seen": [2, None],
-}
+from tests.support.half_heard import COLUMNS
 
 
 def _request(step: int = 2, /, **columns: list[Any]) -> DecideRequest:
@@ -47,7 +38,7 @@ def test_the_digest_is_the_same_for_the_same_request_only() -> None:
     ]
     digests = [digest_of(request) for request in different]
     assert len(set(digests)) == len(different)
-    assert digest_of(_request(queue=[4.0, None])) == digests[0]
+    assert digest_of(_request(queue=[4, None])) == digests[0]
 
 
 @pytest.mark.parametrize("request_", [_request(), _request(x=[], y=[]), _batch(_request())])

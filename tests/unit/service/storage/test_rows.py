@@ -7,16 +7,8 @@ import pytest
 from service.mission.events import Reported
 from service.storage.rows import decode, encode, pack
 from shared.wire.schemas import UavState
+from tests.support.half_heard import COLUMNS
 
-COLUMNS = {
-    "id": [3, 8],
-    "x": [10.0, 20.5],
-    "y": [0.0, 1.0],
-    "queue": [4.0, None],
-    "battery": [50.0, None],
-    "channel_gain": [-80.0, None],
-    "last_seen": [2, None],
-}
 REPORT = {"uav_id": 1, "position": [1.0, 2.0], "progress_m": 7.5, "top_speed_mps": 9.0, "sensors": COLUMNS}
 
 
