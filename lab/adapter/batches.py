@@ -1,7 +1,7 @@
 """Batches of compact prompts with the teacher's probabilities, for any number of rows, from records on a GPU.
 
 Each time that a decision is drawn, its rows are shuffled, its sensors' signs are drawn anew, and it has a number of
-rows of its own. The targets are those of :mod:`lab.distilling.examples`.
+rows of its own.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ LETTERS = "ABCDEFGHIJKLMNOPQRST"
 _MOST_EXPERIENCES = 8
 # The columns of ``vel`` and ``lost`` that a prompt with so many options a row has.
 _COLUMNS = {4: [0, 1, 2, 3], 3: [0, 4, 3], 2: [0, 3], 1: [5]}
-_REFERENCE_SHARE, _AFTER_FAILURE, _HELD_OUT = 0.6, 0.15, 11
+_REFERENCE_SHARE, _AFTER_FAILURE, _HELD_OUT = 0.2, 0.15, 11
+# Packets of regret that make an answer e times less likely; and packets that a metre a second is worth.
+_TEMPERATURE, _WORTH_OF_VELOCITY = 0.3, 0.2 / 14
 _NINE_OF_FASTEST = 9 / 14
 
 
@@ -29,7 +31,8 @@ class PromptBatch:
     """B prompts of r rows with V options: tokens ``(B, T)``, targets ``(B, r, V)``, the places of the rows' letters.
 
     ``regret`` ``(B, r, V)`` is what each answer is expected to lose above the best of all sensors and options;
-    ``planned`` ``(B, r, V)`` whether it is the planner's, of which a prompt may have none.
+    ``planned`` ``(B, r, V)`` whether it is the planner's, of which a prompt may have none. ``sensors`` ``(B, r)`` and
+    ``velocities`` ``(B, r, V)`` are the answers themselves, as a sensor's place in the records and in m/s.
     """
 
     tokens: Tensor
@@ -37,6 +40,8 @@ class PromptBatch:
     letters_at: Tensor
     regret: Tensor
     planned: Tensor
+    sensors: Tensor
+    velocities: Tensor
 
 
 class PromptTokens:
@@ -57,7 +62,7 @@ class PromptTokens:
 class RecordTensors:
     """Records as tensors on a device, and batches of them; those of each eleventh world are held out."""
 
-    def __init__(self, arrays: Mapping[str, np.ndarray], tokens: PromptTokens, device: str) -> None:
+    def __init__(self, arrays: Mapping[str, np.ndarray], tokens: PromptTokens, device: str = "cpu") -> None:
         self._tokens, self._device = tokens, device
         kept = arrays["n"] >= 2
         names = ("fleet", "rows", "vel", "lost", "ref", "refv", "failing", "n")
@@ -81,9 +86,12 @@ class RecordTensors:
 
     def _members_of(self, k: int, experiences: int, held_out: bool) -> dict[int, Tensor]:
         own = self.held_out if held_out else self.training
-        own = own[self.experiences[own] == experiences]
-        shown = self._of["n"][own].clamp(max=k)
-        return {int(rows): own[shown == rows] for rows in shown.unique().tolist()}
+        return self.shown(own[self.experiences[own] == experiences], k)
+
+    def shown(self, which: Tensor, k: int) -> dict[int, Tensor]:
+        """These decisions, by the rows that a prompt of at most k shows."""
+        shown = self._of["n"][which].clamp(max=k)
+        return {int(rows): which[shown == rows] for rows in shown.unique().tolist()}
 
     def batch(self, which: Tensor, k: int, rows: int, experiences: int, drawn: torch.Generator) -> PromptBatch:
         """The prompts of these decisions, all of so many rows and experiences."""
@@ -115,8 +123,8 @@ class RecordTensors:
         text = torch.cat((head, tokens.uav.expand(count, 1), lines.flatten(1), tokens.after.expand(count, -1)), dim=1)
         at = head.shape[1] + lines.shape[2] * torch.arange(1, rows + 1, device=self._device)
         planned = _planned(velocities, order == own["ref"][:, None], own["refv"])
-        targets = _targets(lost, velocities, planned, shuffled("failing"))
-        return PromptBatch(text, targets, at, lost - own["best"][:, None, None], planned)
+        targets = targets_of(lost, velocities, planned, shuffled("failing"))
+        return PromptBatch(text, targets, at, lost - own["best"][:, None, None], planned, order, velocities)
 
     def _read(self, entries: Tensor, signs: Tensor) -> Tensor:
         """The tokens of experiences ``(B, e, 4)``."""
@@ -132,13 +140,22 @@ def _planned(velocities: Tensor, is_sensor: Tensor, velocity: Tensor) -> Tensor:
     return is_sensor[..., None] & (velocities == velocities.gather(2, nearest))
 
 
-def _targets(lost: Tensor, velocities: Tensor, planned: Tensor, failing: Tensor) -> Tensor:
+def targets_of(lost: Tensor, velocities: Tensor, planned: Tensor, failing: Tensor) -> Tensor:
+    """By regret, and a share for the planner's sensor; within a sensor by regret alone.
+
+    More than half of the options lose nothing in any of the evaluator's futures. Among these the faster one is to be
+    learned: a student that spreads over them has no reason for any velocity, and its likeliest answer is arbitrary.
+    """
+    worth = lost - _WORTH_OF_VELOCITY * velocities
     times = (velocities[..., :, None] == velocities[..., None, :]).sum(dim=-1)
-    by_regret = torch.exp(-(lost - lost.amin((1, 2), keepdim=True)).clamp(max=60.0)) / times
+    by_regret = torch.exp(-(worth - worth.amin((1, 2), keepdim=True)).clamp(max=15.0) / _TEMPERATURE) / times
     by_regret = by_regret / by_regret.sum((1, 2), keepdim=True)
-    reference = planned / planned.sum((1, 2), keepdim=True).clamp(min=1)
-    shown = planned.any(2).any(1)[:, None, None]
-    targets = torch.where(shown, (1 - _REFERENCE_SHARE) * by_regret + _REFERENCE_SHARE * reference, by_regret)
+    within = torch.exp(-(worth - worth.amin(2, keepdim=True)).clamp(max=15.0) / _TEMPERATURE) / times
+    within = within / within.sum(2, keepdim=True)
+    is_sensor = planned.any(2)
+    shown = is_sensor.any(1)[:, None, None]
+    mixed = (1 - _REFERENCE_SHARE) * by_regret + _REFERENCE_SHARE * is_sensor[..., None] * within
+    targets = torch.where(shown, mixed, by_regret)
     targets = targets * torch.where(failing[..., None] == 1, _AFTER_FAILURE, 1.0)
     return targets / targets.sum((1, 2), keepdim=True)
 

@@ -38,6 +38,7 @@ from service.mission.mission import Mission
 from service.prompting.candidates import Viewpoint, velocity_options
 from service.prompting.compact_prompt import Outlook, fleet_digits, row_digits, sign
 from shared.wire.schemas import MissionSpec
+from shared.world.scenario import Scenario
 from shared.world.step_rule import Action
 
 ROWS, OPTIONS = 10, 6
@@ -59,12 +60,11 @@ def records_of(recording: Path) -> dict[str, np.ndarray]:
     return {name: np.array([record[name] for record in found]) for name in found[0]}
 
 
-def _mission_records(header: Header, number: int, logged: list[RolloutStep]) -> list[Record]:
-    mission_id = logged[0].request.mission_id
-    seed = int(mission_id.rpartition("-")[2])
-    belief, experiences = _VIEWS[(number + seed) % len(_VIEWS)]
+def mission_of(scenario: Scenario, mission_id: str, seed: int, view: int) -> Mission:
+    """A mission whose states are recorded, in the view of that number."""
+    belief, experiences = _VIEWS[view % len(_VIEWS)]
     spec = {
-        "scenario": header.scenario,
+        "scenario": scenario,
         "planner": "off",
         "features": "reach",
         "belief": belief,
@@ -73,18 +73,24 @@ def _mission_records(header: Header, number: int, logged: list[RolloutStep]) -> 
         "seed": seed,
     }
     settings = Settings(mode="guided", store="none", llm_adapter="served")
-    mission = Mission(mission_id, MissionSpec.model_validate(spec), settings)
-    shared = {"mission": seed, "scenario": header.scenario.name}
+    return Mission(mission_id, MissionSpec.model_validate(spec), settings)
+
+
+def _mission_records(header: Header, number: int, logged: list[RolloutStep]) -> list[Record]:
+    mission_id = logged[0].request.mission_id
+    seed = int(mission_id.rpartition("-")[2])
+    mission = mission_of(header.scenario, mission_id, seed, number + seed)
     return [
-        {**_record(state, step.reference, belief == "fleet", bool(experiences)), **shared}
+        record_of(state, step.reference)
         for step, state in recorded_states(mission, logged)
         if step.reference is not None and state.rows
     ]
 
 
-def _record(state: AttendedState, reference: Reference, learned: bool, experienced: bool) -> Record:
+def record_of(state: AttendedState, reference: Reference) -> Record:
+    """The record of a decision in a state that has candidates."""
     mission, scenario, rows = state.mission, state.mission.scenario, state.rows[:ROWS]
-    view = Viewpoint(mission.belief, state.uav_id, state.step, learned=learned)
+    view = Viewpoint(mission.belief, state.uav_id, state.step, learned=mission.belief_source == "fleet")
     outlook, reach = Outlook.of(view, scenario), state.reach
     velocities = [
         [*velocity_options(reach, row, 4), velocity_options(reach, row, 3)[1], int(reach.best[row])] for row in rows
@@ -109,7 +115,9 @@ def _record(state: AttendedState, reference: Reference, learned: bool, experienc
         "ref": np.int8(where[0] if len(where) else -1),
         "refv": np.int8(reference.velocity),
         "failing": _padded([sign(int(sensor)) in failing for sensor in ids], (ROWS,), np.int8),
-        "blocks": "".join(block) if experienced else "",
+        "blocks": "".join(block) if mission.spec.prompt.experiences else "",
+        "mission": mission.spec.seed,
+        "scenario": scenario.name,
     }
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, from_numpy
 from torch.nn.functional import linear
 
+from lab.adapter.model import half_precision
 from lab.distilling.gguf_adapter import GgufAdapter, write_gguf_adapter
 from service.llm.adapter_version import Version
 
@@ -45,7 +46,7 @@ class Student:
         base = AutoModelForCausalLM.from_pretrained(
             gguf.parent,
             gguf_file=gguf.name,
-            dtype=(dtype := _dtype(device)),
+            dtype=(dtype := half_precision(device)),
             quantization_config=GgufConfig(dequantize=True),
         )
         base.config.use_cache = False
@@ -150,10 +151,3 @@ class Student:
 def _heads(config: Any) -> dict[str, int]:
     """The attention heads of a model."""
     return {"heads": config.num_attention_heads, "kv_heads": config.num_key_value_heads}
-
-
-def _dtype(device: str) -> torch.dtype:
-    """bfloat16 where the device multiplies it fast: other processors take forty times as long as for float32."""
-    known = torch.cpu.get_capabilities()
-    fast = device != "cpu" or known.get("avx512_bf16", False) or known.get("amx_bf16", False)
-    return torch.bfloat16 if fast else torch.float32

@@ -184,6 +184,8 @@ class _EdgeFleet:
         self._client = EdgeClient(url, timeout_s=_TIMEOUT_S)
         self._mission_id = f"explore-{mission}-{secrets.token_hex(4)}"
         self._pilot = EdgePilot(self._client, self._mission_id, scenario, mission, deadline_ms=_DEADLINE_MS)
+        # Where these change a decision, the states are not those that the LLM brings about.
+        self._pilot.spec = self._pilot.spec.model_copy(update={"planner": "off", "verify": "off"})
         self._choices: dict[int, PilotChoice] = {}
 
     def __enter__(self) -> Self:
