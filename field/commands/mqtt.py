@@ -60,14 +60,12 @@ def main(argv: list[str]) -> int:
     if options.check == "on":
         print(_in_words(configuration))
         return 0
-    import httpx
+    from shared.client.retries_and_redirects import edge_url
 
     try:
-        edge = httpx.URL(options.edge)
-    except httpx.InvalidURL:
-        edge = httpx.URL("")
-    if edge.scheme not in ("http", "https") or not edge.host or edge.userinfo:
-        return _refused(f"--edge: {options.edge[:80]!r} is not an edge's URL; write it like http://127.0.0.1:8000")
+        edge_url(options.edge)
+    except ValueError as error:
+        return _refused(f"--edge: {error}")
     if not 0 <= options.metrics_port <= 65535:
         return _refused(f"--metrics-port {options.metrics_port} is not between 0 and 65535")
     level = getattr(logging, options.log_level.upper())

@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,8 @@ from simulator.world.observation import StepTally
 
 # Parts of a step in which the speed is corrected; in the last one a new speed would take effect too late.
 _PARTS = 5
+
+T = TypeVar("T")
 
 
 class Clock(Protocol):
@@ -198,6 +200,14 @@ class FieldFlight:
             self.result.not_carried_out.append(str(error))
             self._on_event(uav.index, str(error))
 
+    async def _received(self, uav: FieldUav, receiving: Awaitable[T], nothing: T) -> T:
+        """What a radio receives; nothing where it fails, whatever a user's radio raises."""
+        try:
+            return await receiving
+        except Exception as error:
+            self._on_event(uav.index, f"its radio fails: {type(error).__name__}: {error}")
+            return nothing
+
     async def _collect(self, legs: Sequence[_Leg], step: int) -> None:
         """Collect in the order of the UAVs, hear the sensors at the next waypoint, and record the outcomes."""
         collected = {}
@@ -208,7 +218,8 @@ class FieldFlight:
                 decided_m, flown_m = self.result.metres.get(leg.uav.index, (0.0, 0.0))
                 decided_m += leg.choice.velocity * self._scenario.step_s
                 self.result.metres[leg.uav.index] = decided_m, flown_m + leg.uav.flown_m - leg.start_m
-            collected[leg.uav.index] = await self._radio.collect(leg.uav.spot(step), leg.choice.sensor)
+            collecting = self._radio.collect(leg.uav.spot(step), leg.choice.sensor)
+            collected[leg.uav.index] = await self._received(leg.uav, collecting, Collected(0, failed=True))
         lost, grown = await self._listen(step + 1)
         for leg in legs:
             got, index = collected[leg.uav.index], leg.uav.index
@@ -247,7 +258,7 @@ class FieldFlight:
 
         Returns the packets that they lost: by UAV, since that UAV last heard them; by sensor, since any UAV did.
         """
-        heard = {uav.index: await self._radio.beacons(uav.spot(step)) for uav in self._uavs}
+        heard = {uav.index: await self._received(uav, self._radio.beacons(uav.spot(step)), {}) for uav in self._uavs}
         counters: dict[int, int] = {}
         for beacons in heard.values():
             for sensor, beacon in beacons.items():

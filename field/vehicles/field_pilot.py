@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 from shared.client.calls import Exchange
 from shared.client.edge_client import AsyncEdgeClient
-from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
+from shared.client.errors import EdgeError, EdgeRefused, EdgeUnreachable
 from shared.wire.missions import MissionStatus
 from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
 from shared.world.scenario import Scenario
@@ -109,20 +109,24 @@ class FieldPilot:
         try:
             async with asyncio.timeout(self._patience_s):
                 for outcome in (*self._unstored_outcomes, *self._pending_outcomes.values()):
-                    await self._client.feedback(FeedbackRequest(mission_id=self._mission_id, **outcome.model_dump()))
+                    request = FeedbackRequest(mission_id=self._mission_id, **outcome.model_dump())
+                    try:
+                        await self._client.feedback(request)
+                    except EdgeRefused as refused:
+                        self.last_error = str(refused)
         except (EdgeError, TimeoutError) as error:
             self.last_error = str(error) or f"no answer within {self._patience_s:g} s"
 
     async def _answer(self, uav: int, observation: Observation, of_itself: Mapping[str, float]) -> PilotChoice | str:
         """The edge's choice, or the reason why there is none."""
         outcome = self._pending_outcomes.get(uav)
-        request = decide_request(uav, observation, self._mission_id, deadline_ms=self._deadline_ms, outcome=outcome)
-        request = request.model_copy(update=dict(of_itself))
-        self.on_request(request)
         try:
+            request = decide_request(uav, observation, self._mission_id, deadline_ms=self._deadline_ms, outcome=outcome)
+            request = request.model_copy(update=dict(of_itself))
+            self.on_request(request)
             async with asyncio.timeout(self._patience_s):
                 exchange = await self._ask(request)
-        except (EdgeError, UsageError, TimeoutError) as error:
+        except (EdgeError, UsageError, TimeoutError, ValueError) as error:
             self.last_error = str(error) or f"no answer within {self._patience_s:g} s"
             # An edge that comes back may have lost the mission.
             self._joined = False
@@ -146,7 +150,4 @@ class FieldPilot:
             self._pending_outcomes.pop(request.uav_id, None)
             await self.join()
             exchange = await self._client.decide(request.model_copy(update={"outcome": None}))
-        limit = self._scenario.max_velocity
-        if exchange.response.velocity > limit:
-            raise EdgeProtocolError(f"the edge chose {exchange.response.velocity} m/s, the limit is {limit}")
-        return exchange
+        return exchange.within(self._scenario)

@@ -9,6 +9,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 from field.errors import VehicleError
@@ -83,8 +84,8 @@ async def run_field_mission(job: FieldJob) -> RealFlight:
                 pilot = FieldPilot(client, job.mission_id, job.site.scenario, job.patience_s, job.mode, job.deadline_ms)
                 pilot.spec = job.site.named(pilot.spec)
                 await join_mission(pilot, job)
-                logs = stack.enter_context(open_logs(job, pilot))
                 await wait_for_missions(uavs, job.wait_s, lambda uav, why: print_line(f"waiting for UAV {uav}: {why}"))
+                logs = stack.enter_context(open_logs(job, pilot))
                 flight = FieldFlight(
                     job.site, uavs, job.radio, pilot, MissionClock(job.speedup),
                     lambda decision: log_decision(decision, logs), lambda uav, text: print_line(f"UAV {uav}: {text}"),
@@ -252,7 +253,9 @@ def check_uploaded(items: Sequence[MissionItem], site: Site, uav: int, vehicle: 
     except ValueError as error:
         raise UsageError(f"{vehicle}: its mission cannot be flown: {error}") from None
     flown = [(x, y) for x, y in site.frame.metres(site.frame.bent(path.trajectory)).tolist()]
-    route = site.scenario.routes[uav]
+    # As :func:`path_of` has them: without repeated waypoints, and a way back that is drawn out is not flown twice.
+    route = [point for point, _ in groupby(site.scenario.routes[uav])]
+    route = route[: len(route) // 2 + 1] if len(route) > 2 and route == route[::-1] else route
     for index, (here, there) in enumerate(zip(flown, route, strict=False)):
         gap = math.dist(here, there)
         if not gap <= TOLERANCE_M:

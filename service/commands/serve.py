@@ -157,7 +157,7 @@ def _serve(listener: socket.socket, settings: Settings, url: str) -> int:
     loaded = (lambda text: None) if _logs_json() else _say
     server = Server(partial(_application, settings, url, loaded), settings.log_level)
     server.run(sockets=[listener])
-    if isinstance(server.error, _Unusable):
+    if isinstance(server.error, (_Unusable, OSError)):
         return _refused(str(server.error))
     if server.error is not None:
         raise server.error

@@ -225,9 +225,10 @@ class Settings(BaseSettings):
 
     @model_validator(mode="after")
     def _prompt_fits(self) -> Self:
-        experiences = self.most_experiences(self.mode)
-        needed = prompt_tokens("csv", self.top_k, experiences)
-        if needed > self.llm_context:
+        experiences = 0 if self.adapted else self.most_experiences(self.mode)
+        written: tuple[PromptFormat, Features] = ("compact", "reach") if self.adapted else ("csv", "paper")
+        needed = prompt_tokens(written[0], self.top_k, experiences, written[1])
+        if self.mode in ("llm", "guided") and needed > self.llm_context:
             raise ValueError(
                 f"{experiences} experiences and {self.top_k} sensors need up to {needed} tokens: "
                 f"raise AICVDS_LLM_CONTEXT (now {self.llm_context}) or lower AICVDS_EXPERIENCES"

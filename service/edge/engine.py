@@ -158,11 +158,11 @@ class Engine:
         self.missions.refuse_if_failing("readings")
         results = mission.read(request.readings)
         self._metrics.record_readings(results)
-        if "merged" in results:
-            try:
-                await self.durable("readings", mission)
-            finally:
-                asyncio.get_running_loop().call_soon(self._feedback.follow_up, mission)
+        try:
+            # A duplicate's first sending may be on no disk yet.
+            await self.durable("readings", mission)
+        finally:
+            asyncio.get_running_loop().call_soon(self._feedback.follow_up, mission)
         return ReadingsResponse(results=results, step=mission.belief.newest)
 
     async def delete(self, mission_id: str) -> None:

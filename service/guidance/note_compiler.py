@@ -159,11 +159,12 @@ class NoteCompiler:
 
     async def _compile_once(self, mission: NoteOwner, note: str) -> None:
         """Compile this note; the result is dropped if the mission has another note by then."""
-        text, unclear = await asyncio.to_thread(mission.in_ids, note)
-        # Compiling the phrases for a first note takes some 40 ms.
-        phrased = await asyncio.to_thread(PhrasedNote, text, mission.scenario, mission.guidance.confirmed.values)
-        unclear += phrased.unsaid
+        unclear: list[str] = []
         try:
+            text, unclear = await asyncio.to_thread(mission.in_ids, note)
+            # Compiling the phrases for a first note takes some 40 ms.
+            phrased = await asyncio.to_thread(PhrasedNote, text, mission.scenario, mission.guidance.confirmed.values)
+            unclear += phrased.unsaid
             async with asyncio.timeout(TIMEOUT_S), self._lock:
                 if not phrased.is_read:
                     await self._wait_for_llm()

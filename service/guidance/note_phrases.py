@@ -234,10 +234,13 @@ class PhrasedNote:
         if kind not in ("step", "through", "steps"):
             return None
         number = numbers_of(match["N"])[0]
-        if kind == "steps":
-            seconds = SECONDS.get(number.unit or "", self._scenario.step_s) * number.value
-            return End(steps=max(1, round(seconds / self._scenario.step_s)))
-        return End(step=int(number.value) + (kind == "through"))
+        seconds = SECONDS.get(number.unit or "", self._scenario.step_s) * number.value
+        try:
+            if kind == "steps":
+                return End(steps=max(1, round(seconds / self._scenario.step_s)))
+            return End(step=int(number.value) + (kind == "through"))
+        except ValueError:
+            return None
 
     def _visited(self, match: re.Match[str], name: str, values: Mapping[str, float]) -> int | None:
         """The sensor whose visit ends this order, where a visit does."""

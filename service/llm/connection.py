@@ -52,6 +52,10 @@ class Connection:
         terms = "" if self.client is None else str(self.client.terms)
         return f"{self.abilities}; with {terms}" if terms else str(self.abilities)
 
+    def is_named(self, model: str) -> bool:
+        """Whether answers of this server name the model so."""
+        return model in (self.model, self.bare_model)
+
     @property
     def embedded(self) -> bool:
         """Whether the LLM is the embedded one, once it is loaded."""

@@ -116,9 +116,10 @@ class Mission:
         self.record: Callable[[Event], None] = ignore_event
 
     def answer_guidance(self, answer: GuidanceAnswer) -> None:
-        """Apply the operator's answer, in which names stand for IDs too; raises as :meth:`OperatorGuidance.answer`."""
+        """Apply the operator's answer, where a name that is no number stands for its ID; raises as the guidance's."""
         if answer.orders and self.spec.names:
-            listed = [(sensor, name) for sensor, name in enumerate(self.spec.names.sensors) if name]
+            named = enumerate(self.spec.names.sensors)
+            listed = [(sensor, name) for sensor, name in named if name and not name.isdigit()]
             ids = {f"{kind}:{name}": f"{kind}:{sensor}" for sensor, name in listed for kind in ("visit", "weight")}
             answer = answer.model_copy(update={"orders": [ids.get(order, order) for order in answer.orders]})
         self.guidance.answer(answer, self.visit_orders.last + 1)

@@ -3,30 +3,13 @@
 from collections.abc import Mapping, Sequence
 
 from service.prompting.candidates import CandidateSet, Letters, Viewpoint
-from service.prompting.paper_prompt import Template
+from service.prompting.paper_prompt import STATIC_BLOCKS, Template
 from service.prompting.prompt import Prompt, note_block
 from service.prompting.rows import Cells, cells, row
 from service.prompting.unpruned_state import UnprunedState
 from shared.features.augmented_state import Reach, State
 from shared.world.scenario import Scenario
 from shared.world.step_rule import Action
-
-_STATIC = """You direct a fleet of UAVs that collect data packets from ground sensors along a pipeline. \
-At each waypoint you choose{each} one sensor to collect from and the velocity for the next {step_s:g} seconds.
-
-Goal: lose no packets. A sensor's queue holds {capacity} packets; what arrives beyond that is lost.
-
-{listed}Each row is one sensor, {order}: a letter, then
-{number}queue,age,velocity
-queue: packets waiting. age: steps since its last visit. velocity: the fastest, in m/s, at which the UAV can collect; \
-the slowest before it where that is not 0.
-{letters}
-
-Rules:
-1. Prefer a full queue, then a long age.
-2. Fly slowly to stay near full queues, fast when there is little to collect.
-{apart}
-{note}{experiences}Answer with {answer} and nothing else."""
 
 _ONE_UAV = {"each": "", "listed": "", "number": "", "apart": "", "answer": "one letter"}
 _FLEET = {
@@ -81,8 +64,8 @@ class GuidedTemplate(Template):
             "note": note_block(note),
             "experiences": _EXPERIENCES if experiences else "",
         }
-        self.static = _STATIC.format(**fields, **_ONE_UAV)
-        self.fleet_static = _STATIC.format(**fields, **_FLEET)
+        self.static = STATIC_BLOCKS["guided"].format(**fields, **_ONE_UAV)
+        self.fleet_static = STATIC_BLOCKS["guided"].format(**fields, **_FLEET)
 
     def experience(self, seen: Cells, action: Action, cost: float, failed: bool) -> str:
         """A line such as ``52,3>7:0``, with the cost in tenths."""

@@ -3,7 +3,9 @@
 What never changes comes first, for the LLM server's prefix cache: so the cost function stands before the experiences.
 """
 
+import tomllib
 from collections.abc import Sequence
+from importlib.resources import files
 from sys import intern
 
 from service.prompting.prompt import Prompt, note_block
@@ -14,40 +16,8 @@ from shared.wire.schemas import Features
 from shared.world.scenario import Scenario
 from shared.world.step_rule import Action
 
-_STATIC = """You schedule data collection for a fleet of UAVs that fly over ground sensors along a pipeline.
-
-Goal: lose as few packets as possible over all sensors. At each waypoint make two decisions: the one ground sensor to \
-collect from (ID 0 to {last}), and the velocity for the next {step_s:g} seconds (0 to {max_velocity} m/s).
-
-Procedure:
-1. Look at every sensor of the current task: its queue, residual energy, location, channel quality (path loss), time \
-since its last visit, urgency and overflow probability.
-2. Rank the sensors. What speaks for one is a long queue, a high urgency or overflow probability, a long time without \
-a visit, little residual energy and a good channel (low path loss).
-3. Compare with past decisions and what they led to.
-4. Choose exactly one sensor and one velocity.
-
-Scheduling rules:
-- Long queues come first, so that they do not overflow.
-- A better channel (a higher gain, less path loss) makes a transmission more likely to succeed. It fails beyond \
-{radius:g} m, or at a gain of {limit:g} dB or below.
-- Collect from a sensor with a low battery before its energy is used up.
-- A high UrgencyScore comes first, above all with a high OverflowProb: such a sensor is the next to drop packets.
-- A large TimeSinceLastVisit comes first, so that every sensor gets its share and none is neglected.
-
-Velocity strategy, in whole m/s:
-- By the chosen sensor's distance: {far} beyond 50 m, {near} within 50 m, 0 while hovering at it.
-- A higher velocity can shorten the travel time.
-
-Cost:
-- Packet loss: a poor channel (high path loss) loses packets, so a sensor with a better channel costs less.
-- Queue overflow: a queue holds {capacity} packets; what arrives beyond that is dropped, which raises the cost.
-
-The current task is the UAV's waypoint and a row for each of the {kept}, {order}:
-{introduction}
-
-{note}{experiences}Output: exactly two whole numbers with a space between them, sensor_id velocity, \
-and nothing else: no explanation, no reasoning."""
+# The static blocks, before the mission's numbers are in them.
+STATIC_BLOCKS = tomllib.loads(files("service.prompting").joinpath("static_blocks.toml").read_text(encoding="utf-8"))
 
 # The paper's highest velocity within 50 m of the chosen sensor, m/s.
 _NEAR_VELOCITY = 7
@@ -75,7 +45,7 @@ class Template:
     ) -> None:
         self._columns = columns(features)
         order = "the most promising first" if ranked else "in no particular order"
-        static = _STATIC.format(
+        static = STATIC_BLOCKS["paper"].format(
             last=scenario.sensors - 1,
             max_velocity=scenario.max_velocity,
             step_s=scenario.step_s,

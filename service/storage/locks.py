@@ -3,7 +3,6 @@
 import fcntl
 import os
 import time
-from pathlib import Path
 from typing import IO
 
 # How long to retry a lock that another process has, and the interval.
@@ -55,7 +54,7 @@ def sqlite_file(store: str) -> str | None:
     if store == "none":
         return None
     if "://" not in store:
-        return str(Path(store).expanduser())
+        return os.path.expanduser(store)
     # Importing it takes a fifth of a second, and a path needs none of it.
     from sqlalchemy import exc, make_url
 

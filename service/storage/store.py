@@ -80,7 +80,7 @@ class Store:
             else:
                 self.leases = Leases(self._engine)
                 self._migrate()
-        except (sa.exc.SQLAlchemyError, ImportError, OSError, ValueError) as error:
+        except (sa.exc.SQLAlchemyError, ImportError, OSError, RuntimeError, ValueError) as error:
             self.close()
             raise StoreUnusable(cause(error)) from None
         except StoreUnusable:

@@ -3,6 +3,7 @@
 import uuid
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from typing import Self
 
 import httpx
 from pydantic import BaseModel
@@ -25,6 +26,7 @@ from shared.wire.schemas import (
     Readiness,
     Uplink,
 )
+from shared.world.scenario import Scenario
 
 POLL_S = 0.5
 NOT_MODIFIED = 304
@@ -52,6 +54,14 @@ class Exchange:
         round_trip_ms = min(round(self.rtt_ms, 3), MAX_ROUND_TRIP_MS)
         decision_id = self.response.decision_id
         return Outcome(decision_id=decision_id, cost=cost, failed=failed, round_trip_ms=round_trip_ms)
+
+    def within(self, scenario: Scenario) -> Self:
+        """This exchange; raises ``EdgeProtocolError`` for a sensor or a velocity that the scenario does not have."""
+        sensor, velocity = self.response.sensor_id, self.response.velocity
+        if sensor >= scenario.sensors or velocity > scenario.max_velocity:
+            limits = f"there are {scenario.sensors} sensors and at most {scenario.max_velocity} m/s"
+            raise EdgeProtocolError(f"the edge chose sensor {sensor} at {velocity} m/s, {limits}")
+        return self
 
 
 class Calls:
@@ -141,8 +151,6 @@ class Calls:
             sent, tried = sent + len(body), 1 + tried
         rtt_ms = (self._clock() - began) * 1000
         response = parse(DecideResponse, answer)
-        if response.sensor_id not in request.sensors.id:
-            raise EdgeProtocolError(f"{answer.url} chose sensor {response.sensor_id}, which was not offered")
         if (response.uav_id, response.step) != (request.uav_id, request.step):
             raise EdgeProtocolError(f"{answer.url} answered for another UAV or step")
         self._encoder.record_answer(request, response)

@@ -143,11 +143,11 @@ class Requests:
         status = answer.status_code
         if status in RETRIED_STATUS:
             raise TryAgain(f"{status} {_problem(answer).detail}", _retry_after(answer))
-        if status < 400 or status == MISDIRECTED:
+        if status < 300 or status in (304, MISDIRECTED):
             return answer
-        if answer.text.lstrip()[:1] == "<":
-            page = f"it answers {status} with a web page to {send.path}"
-            raise EdgeProtocolError(f"there is no AIC-VDS edge at {base_url}: {page}")
+        if status < 400 or answer.text.lstrip()[:1] == "<":
+            page = "a redirect" if status < 400 else "a web page"
+            raise EdgeProtocolError(f"there is no AIC-VDS edge at {base_url}: {send.path} answers {status}, {page}")
         raise EdgeRefused(url, _problem(answer), status)
 
 

@@ -19,8 +19,8 @@ class Problem(BaseModel):
     """RFC 9457 ``application/problem+json``; ``errors`` names each field at fault."""
 
     type: str = "about:blank"
-    title: str
-    status: int
+    title: str = ""
+    status: int = 0
     detail: str
     errors: list[Fault] = []
     owner: str | None = omitted(

@@ -16,6 +16,8 @@ from simulator.commands.options import check_mission, check_note, check_seed, ed
 from simulator.commands.running import command_main
 from simulator.flying.job import new_mission_id
 
+_HEADER = ' -H "Authorization: Bearer $AICVDS_API_KEY"'
+
 
 @dataclass(frozen=True)
 class Create:
@@ -88,14 +90,14 @@ def create(options: Create, console: Console) -> int:
     if options.note is not None:
         guidance = f"{edge}/missions/{mission_id}/guidance"
         print("# How the LLM compiled the note, after a few seconds, and your confirmation:")
-        print(f"curl {shlex.quote(guidance)}")
+        print(f"curl {shlex.quote(guidance)}{_HEADER if key is not None else ''}")
         print(curl(guidance, '{"answer": "confirm"}', key is not None))
     return 0
 
 
 def curl(url: str, body: str, with_key: bool) -> str:
     """A command that posts the body, to be pasted into a shell."""
-    key = ' -H "Authorization: Bearer $AICVDS_API_KEY"' if with_key else ""
+    key = _HEADER if with_key else ""
     return f"curl -X POST {shlex.quote(url)} -H 'Content-Type: application/json'{key} -d {shlex.quote(body)}"
 
 

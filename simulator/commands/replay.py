@@ -146,7 +146,8 @@ def replay(options: Replay, command: str, console: Console) -> int:
     mission_id = f"{new_mission_id(spec.scenario, spec.seed)}-replay"
     out = options.out or Path("runs") / mission_id
     refuse_old_result(out, options.overwrite, REPLAY)
-    timeout_s = DEFAULT_TIMEOUT_S if options.deadline_ms is None else options.deadline_ms / 1000 + NETWORK_SLACK_S
+    longest_ms = options.deadline_ms or max(request.deadline_ms or 0 for request, _ in logged.decisions)
+    timeout_s = max(DEFAULT_TIMEOUT_S, longest_ms / 1000 + NETWORK_SLACK_S)
     with EdgeClient(edge, timeout_s=timeout_s, api_key=os.environ.get(API_KEY) or None) as client:
         await_edge(client, options.wait_s, console)
         client.put_mission(mission_id, spec)

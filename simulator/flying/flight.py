@@ -7,7 +7,7 @@ import numpy as np
 from pydantic_core import PydanticSerializationError
 
 from simulator.flying.job import BASELINES
-from simulator.flying.pilots import Pilot, PilotChoice
+from simulator.flying.pilots import Pilot, PilotChoice, decided
 from simulator.policies.registry import LearningPolicy, Policy, policy_named
 from simulator.records.decision import Decision
 from simulator.records.flight import Flight
@@ -143,7 +143,7 @@ def rollout(
         taken: frozenset[int] = frozenset()
         step, live = len(world.tally), dict(world.live)
         for agent, uav in live.items():
-            actions[agent] = policy.decide(uav, observations[agent], taken)
+            actions[agent] = decided(policy, uav, observations[agent], taken)
             taken |= {actions[agent][0]}
         observations, _, _, _, infos = world.step(actions)
         if isinstance(policy, LearningPolicy):

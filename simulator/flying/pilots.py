@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from shared.client.calls import Exchange
 from shared.client.edge_client import EdgeClient
-from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
+from shared.client.errors import EdgeError, EdgeRefused, EdgeUnreachable
 from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
 from shared.world.scenario import Scenario
 from simulator.policies.registry import LearningPolicy, Policy, policy_named
@@ -47,6 +47,15 @@ class Pilot(Protocol):
         """Finish the mission."""
 
 
+def decided(policy: Policy, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
+    """A policy's sensor and velocity; raises ``ValueError`` unless they are two whole numbers."""
+    sensor, velocity = policy.decide(uav, observation, taken)
+    if (int(sensor), int(velocity)) != (sensor, velocity):
+        step = int(observation["step"][0])
+        raise ValueError(f"UAV {uav}, step {step}: ({sensor}, {velocity}) are not two whole numbers")
+    return int(sensor), int(velocity)
+
+
 class LocalPilot:
     """The pilot of a local policy, by default that of the name; every decision counts as taken on board."""
 
@@ -59,10 +68,8 @@ class LocalPilot:
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
         """The policy's choice; raises ``ValueError`` unless it is two whole numbers."""
         self._steps[uav] = int(observation["step"][0])
-        sensor, velocity = self._policy.decide(uav, observation, taken)
-        if (int(sensor), int(velocity)) != (sensor, velocity):
-            raise ValueError(f"UAV {uav}, step {self._steps[uav]}: ({sensor}, {velocity}) are not two whole numbers")
-        return PilotChoice(int(sensor), int(velocity), "onboard", self._reason)
+        sensor, velocity = decided(self._policy, uav, observation, taken)
+        return PilotChoice(sensor, velocity, "onboard", self._reason)
 
     def learn(self, uav: int, choice: PilotChoice, cost: float, failed: bool) -> None:
         """Pass the outcome to the policy, if it learns."""
@@ -125,7 +132,7 @@ class EdgePilot:
         self._mission_id = mission_id
         self.spec = MissionSpec(scenario=scenario, seed=seed, mode=mode, note=note)
         self._deadline_ms = deadline_ms
-        self._max_velocity = scenario.max_velocity
+        self._scenario = scenario
         self._pending_outcomes: dict[int, Outcome] = {}
         # Outcomes sent to an edge that could not write them to disk; they are sent again at the end.
         self._unstored_outcomes: list[Outcome] = []
@@ -183,11 +190,7 @@ class EdgePilot:
             self._client.put_mission(self._mission_id, self.spec)
             exchange = self._client.decide(request.model_copy(update={"outcome": None}))
         self._lost, self._wait_left_s = False, self._reconnect_s
-        if exchange.response.velocity > self._max_velocity:
-            raise EdgeProtocolError(
-                f"the edge chose {exchange.response.velocity} m/s, the limit is {self._max_velocity}"
-            )
-        return exchange
+        return exchange.within(self._scenario)
 
     def learn(self, uav: int, choice: PilotChoice, cost: float, failed: bool) -> None:
         """Store the outcome for this UAV's next request."""

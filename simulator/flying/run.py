@@ -29,7 +29,6 @@ from simulator.reporting.results import write_results
 if TYPE_CHECKING:
     from simulator.flying.flight_metrics import FlightMetrics
     from simulator.flying.pilots import Pilot, PilotChoice
-    from simulator.records.flight import Flight
     from simulator.world.observation import StepTally
 
 
@@ -187,20 +186,24 @@ def _fly_again(job: Job, mode: Mode, edge: EdgeClient, console: Console) -> list
 
 
 def _others(job: Job, flight: Flight, console: Console, alive: Callable[[], None]) -> dict[str, list[StepTally]]:
-    """The tallies of the policies to compare with, over the steps flown; a mode that failed is left out."""
+    """The tallies of the policies to compare with, over the steps flown; what fails, or is interrupted, is left out."""
     from simulator.flying.flight import baselines
 
-    modes = [name.partition(":")[2] for name in job.against if name.startswith(EDGE_MODE)]
-    local = [name for name in job.against if not name.startswith(EDGE_MODE)]
-    flown = baselines(job.site, job.seed, flight.steps_flown, local)
-    if job.edge is None or not modes or flight.interrupted:
-        return flown
-    with job_client(job, job.edge) as edge:
-        await_edge(edge, job.wait_s, console, alive, job.wait_out)
-        for mode in modes:
-            tally = _fly_again(job, cast(Mode, mode), edge, console)
-            if tally is not None:
-                flown[f"{EDGE_MODE}{mode}"] = tally[: flight.steps_flown]
+    flown: dict[str, list[StepTally]] = {}
+    for name in job.against:
+        try:
+            if not name.startswith(EDGE_MODE):
+                flown |= baselines(job.site, job.seed, flight.steps_flown, [name])
+            elif job.edge is not None and not flight.interrupted:
+                with job_client(job, job.edge) as edge:
+                    await_edge(edge, job.wait_s, console, alive, job.wait_out)
+                    tally = _fly_again(job, cast(Mode, name.removeprefix(EDGE_MODE)), edge, console)
+                flown |= {} if tally is None else {name: tally[: flight.steps_flown]}
+        except (EdgeError, ValueError) as error:
+            print(f"{name} was not flown: {error}", file=sys.stderr)
+        except KeyboardInterrupt:
+            print(f"{name} was not flown to its end: interrupted", file=sys.stderr)
+            break
     return flown
 
 

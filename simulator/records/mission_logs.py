@@ -102,7 +102,8 @@ class RequestLog(_Log[DecideRequest]):
 
 def with_edge_defaults(spec: MissionSpec, status: MissionStatus) -> MissionSpec:
     """The spec with the defaults of the edge that made the mission, independent of another edge's defaults."""
-    return spec.model_copy(update={"mode": status.mode, "top_k": status.top_k, "prompt": status.prompt})
+    given = ("mode", "top_k", "attention", "prompt", "features", "belief", "verify", "planner", "init")
+    return spec.model_copy(update={name: getattr(status, name) for name in given})
 
 
 def read_requests(path: Path) -> tuple[MissionSpec, list[DecideRequest]]:

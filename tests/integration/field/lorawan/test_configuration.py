@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from field.commands import mqtt
 from field.lorawan.configuration import Configuration, ConfigurationError, read_configuration
 from tests.support.places import ROOT
 
@@ -146,3 +147,10 @@ def test_a_fault_is_told_in_plain_words(tmp_path: Path, old: str, new: str, said
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="No such file"):
         read_configuration(tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize("edge", ["http://127.0.0.1:8000/?mission=m", "ftp://edge", "http://me:secret@edge", "edge"])
+def test_an_edge_that_is_none_is_one_line(edge: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert mqtt.main([str(EXAMPLE), "--edge", edge]) == 2
+    error = capsys.readouterr().err
+    assert "--edge: " in error and error.count("\n") == 1

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from field.errors import VehicleError
+from field.vehicles import field_run
 from field.vehicles.field_run import FieldJob, run_field_mission
 from field.vehicles.field_uav import LEAST_SPEED_M_S, FieldUav
 from field.vehicles.mavlink_vehicle import MavlinkVehicle, mavlink_vehicle
@@ -227,3 +229,16 @@ def test_who_does_not_fly_is_named(missions: list[list[Item]], port: int, tmp_pa
         assert flown.returncode == 1
         assert "waiting for UAV 0: it is not armed" in flown.stderr and "arm it, take off and start" in flown.stderr
         assert peer.commands() == []
+
+
+def test_a_vehicle_that_does_not_take_off_leaves_no_log_in_the_way(
+    missions: list[list[Item]], port: int, edge: Edge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def waits_in_vain(*_: object) -> None:
+        raise VehicleError("UAV 0 does not fly its mission")
+
+    monkeypatch.setattr(field_run, "wait_for_missions", waits_in_vain)
+    url = str(edge(mode="policy").base_url).rstrip("/")
+    with mavsdk_peer(missions[0], port, speedup=20.0), pytest.raises(VehicleError, match="does not fly its mission"):
+        asyncio.run(run_field_mission(patient_job(port, url, tmp_path, steps=2)))
+    assert not (tmp_path / "decisions.jsonl").exists()

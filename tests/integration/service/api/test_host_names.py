@@ -59,6 +59,7 @@ def test_two_names_are_refused(edge: Edge) -> None:
         ({"hosts": "edge, Fleet.example"}, "edge", 200),
         ({"hosts": "edge"}, "edge.example", 403),
         ({"hosts": "edge"}, "localhost", 200),
+        ({"hosts": "edge:8000"}, "edge:8000", 200),
         ({"hosts": "*"}, "evil.example", 200),
         ({"anonymous": "on"}, "192.0.2.1:8000", 200),
         ({"anonymous": "on"}, "evil.example", 403),

@@ -132,3 +132,18 @@ def test_acknowledged_readings_survive_a_power_failure(tmp_path: Path, report: R
         assert same(state(engine.missions.loaded[0]), before)
         again = client.post(PATH, json=one(sensor_id=8, step=2, message_id="y"))
         assert again.json()["results"] == ["duplicate"]
+
+
+def test_readings_that_are_sent_again_are_acknowledged_no_sooner_than_they_are_on_disk(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def not_yet(_timeout_s: float) -> bool:
+        return False
+
+    with running(tmp_path / "m.db") as (client, engine):
+        fly(client, report, range(1))
+        with monkeypatch.context() as slow:
+            slow.setattr(engine.journal, "stored", not_yet)
+            assert [client.post(PATH, json=one(message_id="x")).status_code for _ in range(2)] == [503, 503]
+        again = client.post(PATH, json=one(message_id="x"))
+        assert (again.status_code, again.json()["results"]) == (200, ["duplicate"])

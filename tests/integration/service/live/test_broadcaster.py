@@ -386,3 +386,12 @@ def test_a_round_trip_out_of_bounds_is_refused_by_name(edge: Edge, report: Repor
     refused = edge().post("/decide", json=report(outcome=outcome))
     assert refused.status_code == 422
     assert refused.json()["errors"][0]["field"] == "outcome.round_trip_ms"
+
+
+def test_a_decision_without_candidates_has_a_prompt_in_no_other_words(edge: Edge, report: Report) -> None:
+    """Its text is the paper's, although the mission's prompt is the compact one."""
+    client = edge(llm_adapter="served")
+    client.put("/missions/test", json={"mode": "policy", "prompt": {"format": "compact"}})
+    name = decided(client, report())
+    told = client.get(f"/missions/test/decisions/{name}/prompt")
+    assert (told.status_code, told.json()["in_words"]) == (200, [])

@@ -96,3 +96,14 @@ def test_names_and_map_are_bounded(edge: Edge, wrong: dict[str, object]) -> None
     refused = edge().put("/missions/m", json=wrong)
     assert refused.status_code == 422
     assert refused.json()["errors"][0]["field"].startswith(next(iter(wrong)))
+
+
+def test_an_order_is_withdrawn_by_its_id_where_sensors_are_named_by_other_numbers(edge: Edge) -> None:
+    client = edge()
+    names = {"sensors": [str(sensor + 1) for sensor in range(10)]}
+    client.put("/missions/test", json={"names": names})
+    wishes = [{"sensor_id": sensor, "visit_every": 4} for sensor in (3, 4)]
+    client.post("/missions/test/guidance", json={"guidance": {"sensors": wishes}})
+    client.post("/missions/test/guidance", json={"answer": "confirm"})
+    after = client.post("/missions/test/guidance", json={"answer": "withdraw", "orders": ["visit:4"]}).json()
+    assert [wish["sensor_id"] for wish in after["guidance"]["sensors"]] == [3], after

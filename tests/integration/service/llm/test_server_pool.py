@@ -176,3 +176,24 @@ def test_who_was_asked_later_and_answered_later_is_no_failure(
         assert (asked.count("first"), asked.count("second")) == (12, 12)
         assert client.get("/readyz").json()["standing_by"] == 1
         assert "aicvds_llm_breaker_opened_total 0.0" in client.get("/metrics").text
+
+
+def test_unusable_answers_count_against_the_server_that_gave_them(edge: Edge, report: Report) -> None:
+    """The first server is well but slow, and the second is asked beside it and answers no pair of numbers."""
+    asked: list[str] = []
+
+    class Late(Named):
+        async def deciding(self) -> None:
+            await never.passed()
+
+    with (
+        serving(Late("first", "0 7", asked).app) as first,
+        serving(Named("second", "cheese", asked).app) as second,
+        Gate() as never,
+    ):
+        client = edge(mode="llm", llm_url=f"{first}/v1,{second}/v1", hedge_ms=20)
+        standing_by(client, 1)
+        reasons = [client.post("/decide", json=report(step=step)).json()["reason"] for step in range(8)]
+        assert "answer_format" in reasons
+        ready = client.get("/readyz").json()
+        assert ready["model"] == "first" and ready["llm"] == "ready", ready

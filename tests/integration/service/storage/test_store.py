@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from alembic.config import Config
 
-from service.storage.locks import StoreUnusable
+from service.storage.locks import StoreUnusable, sqlite_file
 from service.storage.rows import SCHEMA
 from service.storage.store import Store
 
@@ -72,3 +72,9 @@ def test_the_schema_is_the_migrations_newest() -> None:
 
     config = _migrations()
     assert ScriptDirectory.from_config(config).get_current_head() == SCHEMA
+
+
+def test_a_home_that_there_is_not_is_named() -> None:
+    with pytest.raises(StoreUnusable, match="home directory"):
+        Store("~nobody_of_this_name/m.db")
+    assert sqlite_file("~nobody_of_this_name/m.db") == "~nobody_of_this_name/m.db"

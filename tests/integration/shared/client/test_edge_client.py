@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 import socket
 import struct
@@ -202,8 +203,11 @@ def test_garbage_is_no_traceback(stub: EdgeStub, request_: DecideRequest, client
     with client(stub.url) as edge:
         with pytest.raises(EdgeProtocolError, match="no DecideResponse"):
             edge.decide(request_)
-        with pytest.raises(EdgeProtocolError, match="sensor 1999, which was not offered"):
-            edge.decide(request_)
+        # A sensor that was not reported is an answer where other UAVs have all that were.
+        found = edge.decide(request_)
+        assert found.response.sensor_id == 1999
+        with pytest.raises(EdgeProtocolError, match="sensor 1999 .* there are 10 sensors"):
+            found.within(SCENARIOS["paper"])
 
 
 async def _whole_request(reader: asyncio.StreamReader) -> None:
@@ -360,3 +364,28 @@ def test_a_lossy_uplink_has_bounds() -> None:
     for drop, jitter in ((1.0, 0.0), (-0.1, 0.0), (0.0, -1.0)):
         with pytest.raises(ValueError):
             LossyTransport(httpx.HTTPTransport(), drop=drop, jitter_ms=jitter, seed=0)
+
+
+async def _not_ready(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    await _whole_request(reader)
+    body = json.dumps({"ready": False, "abilities": "x" * 300, "detail": "the store fails: disk full"}).encode()
+    writer.write(b"HTTP/1.1 503 No\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body))
+
+
+def test_the_cause_of_an_edge_that_is_not_ready_is_named(client: Opened) -> None:
+    with (
+        listening(_not_ready) as url,
+        client(url) as edge,
+        pytest.raises(EdgeUnreachable, match=r"503 the store fails: disk full$"),
+    ):
+        edge.wait_ready(0.0)
+
+
+def test_a_deletion_that_is_redirected_is_none(client: Opened) -> None:
+    with listening(_redirect) as url, client(url) as edge, pytest.raises(EdgeProtocolError, match="302, a redirect"):
+        edge.delete_mission("m")
+
+
+def test_a_key_of_any_letters_is_sent(stub: EdgeStub, request_: DecideRequest) -> None:
+    with EdgeClient(stub.url, api_key="aicvds_\u2026") as edge:
+        assert edge.decide(request_).response.step == request_.step

@@ -39,9 +39,11 @@ def test_a_key_stays_in_its_variable(
     stub: EdgeStub, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("AICVDS_API_KEY", "aicvds_secret")
-    assert mission.main(["create", "--edge", stub.url]) == 0
+    assert mission.main(["create", "--edge", stub.url, "--note", "Visit 4 often."]) == 0
     printed = capsys.readouterr().out
-    assert "$AICVDS_API_KEY" in printed and "aicvds_secret" not in printed
+    commands = [line for line in printed.splitlines() if line.startswith("curl ")]
+    assert len(commands) == 4 and all("$AICVDS_API_KEY" in command for command in commands)
+    assert "aicvds_secret" not in printed
 
 
 @pytest.mark.parametrize(

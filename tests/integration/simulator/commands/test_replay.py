@@ -110,7 +110,7 @@ def test_another_mode_prompt_and_k_are_compared_and_different_decisions_are_not_
     assert again.changed == {
         "mode": ("llm", "value"),
         "top_k": (5, 2),
-        "features": (None, "reach"),
+        "features": ("paper", "reach"),
         "init": ("pretrained", "random"),
         "prompt.experiences": (30, 4),
         "prompt.selection": ("recent", "failures"),

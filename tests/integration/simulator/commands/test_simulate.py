@@ -15,7 +15,7 @@ from simulator.commands import simulate
 from simulator.records.mission_logs import read_decisions
 from simulator.records.run_folder import DRAWN
 from simulator.records.summary import LossBound, Summary
-from tests.support.edge_stub import EdgeStub, stub_edge
+from tests.support.edge_stub import EdgeStub, free_port, stub_edge
 from tests.support.waiting import PATIENCE_S, until
 
 
@@ -279,3 +279,18 @@ def test_help_comes_without_the_heavy_imports() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "[]"
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_flight_is_written_though_what_it_is_compared_with_fails(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "half.py").write_text(OWN_POLICY.replace(", VELOCITY", ", VELOCITY + 0.5"), "utf-8")
+    (tmp_path / "own_part.py").write_text("VELOCITY = 3", "utf-8")
+    failing, out = f"{tmp_path}/half.py:Fullest", tmp_path / "run"
+    arguments = ["--against", failing, "--against", "edge:policy", "--against", "round_robin", "--wait-s", "0"]
+    arguments += ["--edge", f"http://127.0.0.1:{free_port()}", "--no-bound", "--steps", "2", "--out", str(out)]
+    assert simulate.main(["--policy", "eof", *arguments]) == 0
+    assert set(summary_in(out).lost_packets) == {"eof", "wqcs", "round_robin"}
+    printed = capsys.readouterr().err
+    assert f"{failing} was not flown: UAV 0, step 0" in printed and "edge:policy was not flown: no edge" in printed

@@ -249,3 +249,19 @@ def test_losses_are_blamed_on_uavs_with_a_usable_link() -> None:
             distance = np.hypot(*(world.sensors.positions - world.fleet.positions[uav]).T)
             assert info["lost_packets"] == spilt[link_holds(distance, world.scenario)].sum()
     assert sum(t.lost_packets for t in world.tally) > 0
+
+
+def test_a_policys_whole_floats_are_whole_numbers_and_others_an_error() -> None:
+    class Floats:
+        velocity = 7.0
+
+        def reset(self, scenario: Scenario, seed: int) -> None: ...
+
+        def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
+            return uav, self.velocity  # type: ignore[return-value]
+
+    policy = Floats()
+    assert len(rollout(PipelineWorld(SCENARIOS["paper"].model_copy(update={"steps": 2})), policy, 0)) == 2
+    policy.velocity = 7.5
+    with pytest.raises(ValueError, match="not two whole numbers"):
+        rollout(PipelineWorld(SCENARIOS["paper"]), policy, 0)

@@ -39,3 +39,17 @@ def test_a_local_mission_is_refused(tmp_path: Path, frame: int, fault: str) -> N
     items = [replace(item, frame=frame) for item in items_of(((41.5, 39.95), (41.51, 39.95)), 60.0)]
     with pytest.raises(UsageError, match=fault):
         check_uploaded(items, site, 0, "UAV")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        [[10.0, 50.0], [10.002, 50.0], [10.002, 50.0], [10.004, 50.001]],
+        [[10.0, 50.0], [10.002, 50.0], [10.004, 50.001], [10.002, 50.0], [10.0, 50.0]],
+        [[10.0, 50.0], [10.002, 50.0], [10.002, 50.002], [10.0, 50.0]],
+    ],
+    ids=["a waypoint twice", "a way back that is drawn out", "a ring"],
+)
+def test_a_worlds_own_line_is_accepted(tmp_path: Path, line: list[list[float]]) -> None:
+    site = site_from_folder(write(tmp_path, sensor("a", 10.0, 50.0), feature("trajectory", "LineString", line)))
+    assert check_uploaded(items_of([(lon, lat) for lon, lat in line], 60.0), site, 0, "UAV") == 60.0

@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import ValidationError
@@ -46,8 +47,15 @@ def test_a_key_read_from_a_file_loses_its_newline_and_never_shows() -> None:
 
 def test_experiences_that_cannot_fit_the_context_are_refused() -> None:
     with pytest.raises(ValidationError, match="AICVDS_LLM_CONTEXT"):
-        Settings(experiences=200)
-    assert Settings(experiences=200, llm_context=16_384).experiences == 200
+        Settings(llm_adapter="off", experiences=200)
+    assert Settings(llm_adapter="off", experiences=200, llm_context=16_384).experiences == 200
+
+
+@pytest.mark.parametrize("given", [{"mode": "policy", "top_k": 67}, {"mode": "value", "top_k": 100}, {"top_k": 80}])
+def test_only_a_prompt_that_is_written_must_fit_the_context(given: dict[str, Any]) -> None:
+    assert Settings(**given).top_k == given["top_k"]
+    with pytest.raises(ValidationError, match="AICVDS_LLM_CONTEXT"):
+        Settings(**given | {"mode": "llm", "llm_adapter": "off"})
 
 
 @pytest.mark.parametrize("text", ["[1]", "no JSON", '{"a": ', "7"])

@@ -368,3 +368,13 @@ def test_any_note_is_read_or_refused(note: str) -> None:
     except (BadOrders, Impossible, ValueError):
         return
     assert len(found.rest) == len(note.lower()) and isinstance(guidance, Guidance)
+
+
+@pytest.mark.parametrize("until", ["for the next 300 hours", "until step 123456789012", "for 200000 steps"])
+def test_an_end_beyond_all_steps_is_none_and_a_doubt(until: str) -> None:
+    found = phrased(f"Fly at most 9 m/s {until}.")
+    try:
+        orders, doubts = found.completed(NO_GUIDANCE, ())
+    except BadOrders:
+        return
+    assert [*doubts, *found.unsaid], orders

@@ -80,3 +80,13 @@ def test_top_speeds_are_kept_and_a_short_way_of_such_an_airframe_says_nothing_of
     del earlier["tops"]
     again.load_state_dict(earlier)
     assert again.tops == {}
+
+
+@pytest.mark.parametrize("start_m", [500.0, 0.1, LAP.length_m - 0.1])
+@pytest.mark.parametrize("shaken_m", [-0.2, 0.2])
+def test_a_uav_that_hovers_is_blown_nowhere_by_the_noise_of_its_place(start_m: float, shaken_m: float) -> None:
+    """Backwards by centimetres is no lap, and forwards over the end of a lap no lap backwards."""
+    stays = Drift()
+    stays.learn(LAP, start_m, 50.0, (start_m + shaken_m) % LAP.length_m)
+    ways = np.array([0.0, 140.0])
+    assert stays.flown(LAP, start_m, ways)[1] < 140.0
