@@ -141,8 +141,7 @@ class Settings(BaseSettings):
     # Experiences in the prompt before half of them are dropped; unset: 30 in the paper's prompt (mode `llm`), else 8.
     # An appended experience leaves the LLM's prefix cache valid. Dropping costs a prefill of the others, so it is rare.
     experiences: int | None = Field(None, ge=0, le=200)
-    # The experiences in the prompt: `recent` ones, those `similar` to the present state, the `best` and a few of the
-    # worst, or the newest of each sensor, `failures` first.
+    # The experiences in the prompt: `recent` ones, or the newest of each sensor, `failures` first.
     selection: Selection = "recent"
     # Adam's step size for the attention and velocity modules (the paper's table).
     learning_rate: float = Field(5e-4, gt=0, le=1)

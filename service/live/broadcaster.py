@@ -50,7 +50,7 @@ class MissionStream:
         self._made = 0
         self._since = history.order
         self._located = snapshots.located_sensors(mission)
-        self._last_snapshot: tuple[int, bytes] | None = None
+        self._last_snapshot: tuple[tuple[int, int], bytes] | None = None
         self._changed = asyncio.Event()
         self._next_update: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._ticking = asyncio.create_task(self._tick(), name="live-updates")
@@ -122,13 +122,13 @@ class MissionStream:
             self._bytes -= len(self._frames.popleft())
 
     def _snapshot(self) -> bytes:
-        """The snapshot at the last update, shared by all listeners; the next update has every later change."""
-        if self._last_snapshot is None or self._last_snapshot[0] != self._made:
+        """The snapshot at the last update, the same for a second; the next update has every later change."""
+        # It has the seconds since the newest decision and reports.
+        made = self._made, int(time.monotonic())
+        if self._last_snapshot is None or self._last_snapshot[0] != made:
             decisions = self._history.of(self.mission.mission_id)[-_SHOWN:]
-            self._last_snapshot = (
-                self._made,
-                _event("snapshot", snapshots.snapshot(self.mission, decisions, self._watched, self._history.edge)),
-            )
+            shown = snapshots.snapshot(self.mission, decisions, self._watched, self._history.edge)
+            self._last_snapshot = made, _event("snapshot", shown)
         return self._last_snapshot[1]
 
 

@@ -92,12 +92,12 @@ class FleetWatch:
             watched, scenario = self._missions.get(mission.mission_id), mission.scenario
             decided_at = None if watched is None else watched.decided_at
             idle_s = _ENDED_S if decided_at is None else time.monotonic() - decided_at
-            if idle_s >= _ENDED_S or (mission.belief.newest or 0) >= scenario.steps - 1:
+            if idle_s >= _ENDED_S or mission.belief.newest == scenario.steps - 1:
                 continue
-            batteries = {} if watched is None else watched.batteries
-            counts.update({kind: len(found) for kind, found in alarms(mission, mission.deadlines(), batteries).items()})
+            found = alarms(mission, mission.deadlines(), {} if watched is None else watched.batteries)
             if idle_s > max(_SILENT_S, 3 * scenario.step_s):
-                counts["uav_lost"] += len(mission.belief.uavs)
+                found["uav_lost"] = dict.fromkeys(mission.belief.uavs)
+            counts.update({kind: len(subjects) for kind, subjects in found.items()})
         return counts
 
     def forget(self, mission_id: str) -> None:

@@ -117,7 +117,7 @@ def _uav(mission: Mission, watched: Watched, uav: int) -> dict[str, Any]:
     if last.action is not None:
         goal = last.ahead(belief.trajectory(uav), belief.drift, [last.action[1] * mission.scenario.step_s])[0]
     return {
-        "step": last.step,
+        "step": last.taught if last.taught >= 0 else last.step,
         "position": last.position,
         "next": None if goal is None else np.round(goal, 1).tolist(),
         "battery": battery,
@@ -130,14 +130,18 @@ def _guidance(mission: Mission) -> dict[str, Any]:
     """The operator's note, the guidance from it, the orders in force, and the visits that are due, with his names."""
     visits, confirmed = mission.records.visits.tolist(), mission.guidance.confirmed
     report = mission.report_guidance().model_dump(exclude={"mission_id"})
+    orders = [order for order in report["orders"] if order["until"] is None]
+    # As :mod:`service.live.alarms` counts: from the last visit, or from the order's first step.
+    since = {order["name"]: max(order["since_step"] - 1, -1) for order in orders}
     return {
         **report,
-        "orders": [order for order in report["orders"] if order["until"] is None],
+        "orders": orders,
         "due": [
-            {"sensor_id": one.sensor_id, "visit_every": one.visit_every, "due": visits[one.sensor_id] + one.visit_every}
+            {"sensor_id": one.sensor_id, "visit_every": one.visit_every, "due": last + one.visit_every}
             for one in confirmed.sensors
             if one.visit_every is not None
             and not once(name := f"visit:{one.sensor_id}", one.visit_every, confirmed.ends.get(name))
+            for last in [max(visits[one.sensor_id], since.get(name, -1))]
         ],
     }
 

@@ -51,7 +51,9 @@ export function alarms(mission) {
   const soon = heard.filter((id) => !full.includes(id) && now.full_in[id] <= SOON_STEPS).sort((a, b) => now.full_in[a] - now.full_in[b]);
   const unheard = ids.filter((id) => now.step - now.heard[id] > UNHEARD_STEPS).sort((a, b) => now.heard[a] - now.heard[b]);
   const worse = Object.keys(now.excess_db).sort((a, b) => now.excess_db[b] - now.excess_db[a]);
-  const { uav_lost: lost, uav_off_path: off, uav_battery: flat, visit_late: late, sensor_battery: battery } = now.alarms;
+  const { uav_lost: known, uav_off_path: off, uav_battery: flat, visit_late: late, sensor_battery: battery } = now.alarms;
+  const everyone = Object.fromEntries(Object.entries(now.uavs).map(([id, { step }]) => [id, step]));
+  const lost = mission.isSilent && !mission.ended ? everyone : known;
   const low = Object.keys(battery).sort((a, b) => now.battery[a] - now.battery[b]);
   const steps = (since) => Object.values(since).map((step) => ({ step }));
   return [

@@ -61,9 +61,10 @@ async function list() {
       }
       badge();
       const before = JSON.stringify(ready);
-      ready = await ask("readyz").catch(() => null);
+      // Its 503 has the same body, with the cause.
+      ready = await fetch("readyz", { cache: "no-store" }).then((answer) => answer.json()).catch(() => null);
       if (mission && JSON.stringify(ready) !== before) soon();
-      const next = wanted ?? told.newest ?? told.missions.find((one) => one.mode)?.mission_id ?? null;
+      const next = wanted ?? (stays(told) ? following : null) ?? told.newest ?? told.missions.find((one) => one.mode)?.mission_id ?? null;
       if (next === null) nothing(told);
       else if (next !== following) follow(next);
     } catch (error) {
@@ -71,6 +72,13 @@ async function list() {
     }
     await pause(LISTED_EVERY_MS);
   }
+}
+
+/** Whether the page stays with its mission, although another may be newer: it flies, or an order is being written. */
+function stays(told) {
+  if (mission?.id !== following || !told.missions.some((one) => one.mission_id === following)) return false;
+  const writes = at("note-input").value || document.activeElement === at("orders-input");
+  return writes || (!mission.ended && mission.idleS !== null && !mission.isSilent);
 }
 
 function offer(told) {
@@ -243,7 +251,10 @@ at("pause").addEventListener("click", () => {
 
 setInterval(() => {
   showClock(mission);
-  if (mission && !paused) showFleet(mission);
+  if (!mission || paused) return;
+  showFleet(mission);
+  // A fleet that falls silent brings no update.
+  showAlarms(mission, ready);
 }, 1000);
 showClock(null);
 list();

@@ -62,10 +62,17 @@ export class Mission {
     return this.now.idle_s === null ? null : this.now.idle_s + this.age;
   }
 
+  /** Whether no UAV has asked for so long that the whole fleet may be lost; it is the limit of the alert `uav_lost`. */
+  get isSilent() {
+    return this.idleS > Math.max(30, 3 * this.scenario.step_s);
+  }
+
   /** Whether every UAV has its decision of the mission's last step, or those that have none no longer ask. */
   get ended() {
     const { uavs, steps } = this.scenario;
     if (this.now.step < steps - 1) return false;
+    // A fleet may fly on past its scenario's last step.
+    if (this.now.step >= steps) return this.isSilent;
     return this.decidedIn(steps - 1) >= uavs || this.idleS > ASKING_S;
   }
 

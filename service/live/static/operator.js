@@ -104,7 +104,7 @@ export class Operator {
     const rows = due.map((order) => {
       const late = order.due < step;
       const text = late ? `late: it was due by step ${order.due}` : `due by step ${order.due}`;
-      return make("li", late ? { class: "late" } : {}, `S${order.sensor_id}, every ${order.visit_every} steps: ${text}`);
+      return make("li", late ? { class: "late" } : {}, `${this.mission.sensor(order.sensor_id)}, every ${order.visit_every} steps: ${text}`);
     });
     at("deadlines-list").replaceChildren(...rows);
   }

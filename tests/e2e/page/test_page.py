@@ -303,3 +303,19 @@ def test_the_page_says_what_the_records_say(visit: Open, edge: str, tmp_path: Pa
         if count:
             words = {"value": "learned values", "policy": "LLM-free policy"}[source]
             assert any(f"{count} {words}" in text for text in detail)
+
+
+def test_the_page_stays_with_a_mission_that_flies_although_another_is_newer(
+    another_edge: str, visit: Open, report: Report
+) -> None:
+    def decide(mission: str, step: int) -> None:
+        httpx.post(f"{another_edge}/decide", json=report(mission_id=mission, step=step)).raise_for_status()
+
+    decide("first", 0)
+    page = visit(another_edge)
+    expect(page).to_have_title("first · AIC-VDS")
+    decide("second", 0)
+    expect(page.locator("#picker option").first).to_have_text("Newest: second")
+    decide("first", 1)
+    expect(page.locator("#feed li")).to_have_count(2)
+    expect(page).to_have_title("first · AIC-VDS")

@@ -94,3 +94,17 @@ def test_missions_that_fly_now_count_and_silent_ones_have_lost_their_uavs(monkey
     fly(fleet, PAPER.steps - 1, off_m=60.0)
     watch.decided(fleet, uav(), PAPER.steps - 1)
     assert watch.alarms([fleet]) == {}
+
+
+def test_a_silent_fleet_has_lost_each_uav_once_also_past_its_scenarios_last_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr("service.live.fleet_watch.time", clock)
+    fleet, watch = mission(), FleetWatch()
+    fly(fleet, 5, number=1)
+    fly(fleet, PAPER.steps + 5)
+    watch.decided(fleet, uav(step=PAPER.steps + 5), PAPER.steps + 5)
+    assert +watch.alarms([fleet]) == {"uav_lost": 1}
+    clock.ahead_s = 3 * PAPER.step_s + 30.0
+    assert +watch.alarms([fleet]) == {"uav_lost": 2}
