@@ -16,6 +16,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lab.precision import half_precision
+
 _LAYERS, _WIDTH, _HEADS, _KV_HEADS, _HEAD = 30, 576, 9, 3, 64
 _RANK = 16
 _EPSILON, _THETA = 1e-5, 1e5
@@ -37,13 +39,6 @@ def dequantised(data: np.ndarray, kind: str) -> np.ndarray:
         least = blocks[..., 2:4].copy().view(np.float16).astype(np.float32)
         values = step * np.concatenate((blocks[..., 4:] & 15, blocks[..., 4:] >> 4), axis=-1) + least
     return np.asarray(values.reshape(*data.shape[:-1], -1), dtype=np.float32)
-
-
-def half_precision(device: str) -> torch.dtype:
-    """bfloat16 where the device multiplies it fast."""
-    known = torch.cpu.get_capabilities()
-    fast = device != "cpu" or known.get("avx512_bf16", False) or known.get("amx_bf16", False)
-    return torch.bfloat16 if fast else torch.float32
 
 
 class _Product(torch.autograd.Function):

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, from_numpy
 from torch.nn.functional import linear
 
-from lab.adapter.model import half_precision
 from lab.distilling.gguf_adapter import GgufAdapter, write_gguf_adapter
+from lab.precision import half_precision
 from service.llm.adapter_version import Version
 
 _MATRICES = ["q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj"]
