@@ -30,7 +30,7 @@ from service.storage.rows import decode, encode, pack
 from shared.wire.schemas import DecideResponse, Outcome, Tokens
 from tests.support.missions import attended, mission, uav
 from tests.support.processes import serving_edge
-from tests.support.waiting import PATIENCE_S, Clock, Gate, until
+from tests.support.waiting import PATIENCE_S, Gate, until
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -395,36 +395,3 @@ def test_a_decision_without_candidates_has_a_prompt_in_no_other_words(edge: Edge
     name = decided(client, report())
     told = client.get(f"/missions/test/decisions/{name}/prompt")
     assert (told.status_code, told.json()["in_words"]) == (200, [])
-
-
-def test_a_later_listener_gets_the_ages_of_his_own_time(
-    edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = Clock()
-    for module in ("broadcaster", "fleet_watch", "snapshots"):
-        monkeypatch.setattr(f"service.live.{module}.time", clock)
-    client = edge()
-    decided(client, report())
-    with watching(client) as early:
-        assert next(early)[1]["idle_s"] < 3600.0
-        clock.ahead_s = 3600.0
-        with watching(client) as late:
-            told = next(late)[1]
-    assert told["idle_s"] >= 3600.0 and told["uavs"]["0"]["heard_s"] >= 3600.0
-
-
-def test_a_new_visit_order_is_due_by_its_own_first_step_and_a_late_uav_shows_its_report(
-    edge: Edge, report: Report
-) -> None:
-    client = edge()
-    for step in range(6):
-        for number in (0, 1):
-            if (step, number) != (5, 1):
-                decided(client, report(step=step, uav_id=number))
-    order = {"guidance": {"sensors": [{"sensor_id": 9, "visit_every": 3}]}}
-    assert client.post("/missions/test/guidance", json=order).status_code == 200
-    with watching(client) as events:
-        told = next(events)[1]
-    [since] = [one["since_step"] for one in told["guidance"]["orders"]]
-    assert since >= 5 and told["guidance"]["due"] == [{"sensor_id": 9, "visit_every": 3, "due": since + 2}]
-    assert [told["uavs"][number]["step"] for number in ("0", "1")] == [5, 4]

@@ -1,0 +1,66 @@
+"""A flight of real UAVs whose radio or edge fails in part."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+from field.vehicles.field_pilot import FieldPilot
+from field.vehicles.radio import Beacon, Collected, Spot
+from shared.client.calls import Exchange
+from shared.client.edge_client import AsyncEdgeClient
+from shared.client.errors import EdgeRefused
+from shared.wire.problem import Problem
+from shared.wire.schemas import FeedbackRequest, FeedbackResponse
+from shared.world.scenario import SCENARIOS
+from simulator.flying.pilots import PilotChoice
+from tests.conftest import Edge
+from tests.integration.field.vehicles.test_field_flight import Counting, Trial, nobody
+from tests.support.waiting import PATIENCE_S
+
+
+class Failing(Counting):
+    """At step 1 the gain has the wrong sign, at step 2 nothing can be heard, and at its end nothing collected."""
+
+    async def beacons(self, spot: Spot) -> dict[int, Beacon]:
+        if spot.step == 2:
+            raise TimeoutError("no modem")
+        return {0: Beacon(30, 40.0, 93.0 if spot.step == 1 and spot.uav == 1 else -90.0, 0)}
+
+    async def collect(self, spot: Spot, sensor: int) -> Collected:
+        if spot.step == 2:
+            raise OSError("no port")
+        return Collected(5, failed=False)
+
+
+async def test_a_radio_that_fails_ends_no_flight(edge: Edge) -> None:
+    trial = Trial(steps=5)
+    trial.radio = Failing([])
+    flown = await trial.fly(str(edge(mode="policy").base_url))
+    assert flown.steps_flown == 5
+    by_step = [[d.source for d in flown.decisions if d.step == step] for step in range(5)]
+    assert [sources.count("onboard") for sources in by_step] == [0, 1, 1, 0, 0]
+    assert trial.last_error is not None and "channel_gain" in trial.last_error
+    assert [d.failed for d in flown.decisions if d.step == 2] == [True] * 3
+    assert {"its radio fails: TimeoutError: no modem", "its radio fails: OSError: no port"} <= {
+        text for _, text in trial.events
+    }
+
+
+async def test_an_outcome_that_is_refused_at_landing_keeps_no_other_back() -> None:
+    sent: list[str] = []
+
+    class Refusing(AsyncEdgeClient):
+        async def feedback(self, outcome: FeedbackRequest) -> FeedbackResponse:
+            sent.append(outcome.decision_id)
+            if len(sent) == 1:
+                raise EdgeRefused("url", Problem(detail="unknown decision"), 404)
+            return FeedbackResponse(decision_id=outcome.decision_id, result="applied")
+
+    async with Refusing(nobody()) as client:
+        pilot = FieldPilot(client, "field", SCENARIOS["paper"], PATIENCE_S)
+        for uav in range(3):
+            answer: Any = SimpleNamespace(decision_id=f"{uav:032x}")
+            pilot.learn(uav, PilotChoice(0, 7, "policy", "mode_policy", Exchange(answer, 1.0, 1, 1, 1)), 0.0, False)
+        await pilot.land()
+    assert len(sent) == 3 and pilot.last_error is not None and "unknown decision" in pilot.last_error

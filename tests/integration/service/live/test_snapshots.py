@@ -1,0 +1,41 @@
+"""The snapshot that a page begins with: ages of its own time, due visits, and each UAV's newest report."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.integration.service.live.test_broadcaster import Edge, Report, decided, watching
+from tests.support.waiting import Clock
+
+
+def test_a_later_listener_gets_the_ages_of_his_own_time(
+    edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock()
+    for module in ("broadcaster", "fleet_watch", "snapshots"):
+        monkeypatch.setattr(f"service.live.{module}.time", clock)
+    client = edge()
+    decided(client, report())
+    with watching(client) as early:
+        assert next(early)[1]["idle_s"] < 3600.0
+        clock.ahead_s = 3600.0
+        with watching(client) as late:
+            told = next(late)[1]
+    assert told["idle_s"] >= 3600.0 and told["uavs"]["0"]["heard_s"] >= 3600.0
+
+
+def test_a_new_visit_order_is_due_by_its_own_first_step_and_a_late_uav_shows_its_report(
+    edge: Edge, report: Report
+) -> None:
+    client = edge()
+    for step in range(6):
+        for number in (0, 1):
+            if (step, number) != (5, 1):
+                decided(client, report(step=step, uav_id=number))
+    order = {"guidance": {"sensors": [{"sensor_id": 9, "visit_every": 3}]}}
+    assert client.post("/missions/test/guidance", json=order).status_code == 200
+    with watching(client) as events:
+        told = next(events)[1]
+    [since] = [one["since_step"] for one in told["guidance"]["orders"]]
+    assert since >= 5 and told["guidance"]["due"] == [{"sensor_id": 9, "visit_every": 3, "due": since + 2}]
+    assert [told["uavs"][number]["step"] for number in ("0", "1")] == [5, 4]
