@@ -1,7 +1,7 @@
 """Batches of compact prompts with the teacher's probabilities, for any number of rows, from records on a GPU.
 
 Each time that a decision is drawn, its rows are shuffled, its sensors' signs are drawn anew, and it has a number of
-rows of its own.
+rows of its own. :func:`targets_of` defines the probabilities.
 """
 
 from __future__ import annotations

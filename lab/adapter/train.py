@@ -122,7 +122,7 @@ def train(model: Model, tokens: PromptTokens, records: RecordTensors, args: argp
         optimizer.step()
         step += 1
         now = time.monotonic()
-        if now - written >= _CHECKPOINT_S or done >= 1.0:
+        if now - written >= _CHECKPOINT_S:
             written, half = now, checkpoint.with_suffix(".part")
             own = {name: weight for name, weight in model.named_parameters() if weight.requires_grad}
             torch.save(

@@ -73,7 +73,8 @@ class Explore(ScenarioChanges):
     first: Annotated[int, arg(metavar="N")] = 0
     """Number of the first world: its seed is 1,000,000 more."""
     edge: Annotated[str | None, arg(metavar="URL")] = None
-    """An edge whose decisions are flown, in the edge's own mode, such as http://127.0.0.1:8000."""
+    """An edge whose decisions are flown, in the edge's own mode without planner and verifier, such as
+    http://127.0.0.1:8000."""
     policy: Annotated[str | None, arg(metavar="NAME")] = None
     """A policy whose decisions are flown, such as mpc, or MODULE:CLASS."""
     workers: Annotated[int, arg(metavar="N")] = 1

@@ -162,8 +162,8 @@ async def get_prompt(mission_id: MissionId, decision_id: DecisionId, engine: The
         raise NotFound("decision_id", f"the prompt of decision {decision_id} is unknown or forgotten")
     prompt, mission = decision.prompt, await engine.missions.get(mission_id)
     words = []
-    # Of the prompts only the compact one begins with a digit; a decision without candidates has another.
-    if prompt.state[:1].isdigit():
+    # A decision without candidates has another prompt, which begins with no digit.
+    if mission.spec.prompt.format == "compact" and prompt.state[:1].isdigit():
         words = in_words(prompt.state, [kept.sensor_id for kept in decision.answer.top_k], mission.scenario)
     return DecisionPrompt(
         decision_id=decision_id,

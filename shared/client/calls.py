@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
 from shared.client.report_encoders import DeltaReports, FullReports
-from shared.client.retries_and_redirects import Answer, Requests, Send, Sleep, TryAgain, parse
+from shared.client.retries_and_redirects import NOT_MODIFIED, Answer, Requests, Send, Sleep, TryAgain, parse
 from shared.planning.guidance_messages import GuidanceAnswer, GuidanceStatus
 from shared.wire.missions import MissionStatus
 from shared.wire.problem import INCOMPLETE
@@ -29,7 +29,6 @@ from shared.wire.schemas import (
 from shared.world.scenario import Scenario
 
 POLL_S = 0.5
-NOT_MODIFIED = 304
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from shared.wire.problem import Problem
 RETRIED_STATUS = frozenset({408, 429, 502, 503, 504})
 FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.1, 2.0
 LONGEST_RETRY_AFTER_S = 5.0
-MISDIRECTED = 421
+NOT_MODIFIED, MISDIRECTED = 304, 421
 Answer = TypeVar("Answer", bound=BaseModel)
 Sleep = Callable[[float], Awaitable[None]]
 
@@ -143,7 +143,7 @@ class Requests:
         status = answer.status_code
         if status in RETRIED_STATUS:
             raise TryAgain(f"{status} {_problem(answer).detail}", _retry_after(answer))
-        if status < 300 or status in (304, MISDIRECTED):
+        if status < 300 or status in (NOT_MODIFIED, MISDIRECTED):
             return answer
         if status < 400 or answer.text.lstrip()[:1] == "<":
             page = "a redirect" if status < 400 else "a web page"
