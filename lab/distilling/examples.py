@@ -28,10 +28,9 @@ from shared.wire.schemas import Belief, MissionSpec
 from shared.world.channel import FloatArray
 from shared.world.step_rule import Action
 
-# The teacher's own action has this share of a target; the rest goes by regret.
-_REFERENCE_SHARE = 0.6
-# Packets of regret that make an action e times less likely.
-_TEMPERATURE = 1.0
+# As in :mod:`lab.adapter.batches`: the share of the teacher's sensor (the rest goes by regret), packets of regret that
+# make an action e times less likely, and packets that a metre a second is worth.
+_REFERENCE_SHARE, _TEMPERATURE, _WORTH_OF_VELOCITY = 0.2, 0.3, 0.2 / 14
 # The share that remains to a sensor whose newest experience is a failure that was not expected. In missions that the
 # planner without learning flew, such a sensor failed again in 78 and 66% of the cases after one failure (`faulty`,
 # `shadowed`), in 93 and 85% after two, and in 100 and 93% after more.
@@ -129,7 +128,7 @@ def _example(state: AttendedState, reference: Reference) -> PromptExample:
     labels = "".join(candidates.labels)
     index = np.array([candidates.labels[label] for label in labels])
     chosen = _nearest_label(candidates, labels, Action(reference.sensor_id, reference.velocity))
-    target = _target(lost, index, chosen)
+    target = _target(lost, candidates.actions, index, chosen)
     failing = failing_signs(mission.experiences.block)
     shunned = np.array([sign(candidates.actions[i].sensor_id) in failing for i in index])
     if shunned.any():
@@ -151,16 +150,22 @@ def _with_other_signs(text: str, seed: Sequence[int]) -> str:
     return text.translate(str.maketrans(SIGNS, drawn))
 
 
-def _target(lost: FloatArray, index: np.ndarray, chosen: int) -> FloatArray:
-    """Soft targets by regret, and the reference's share; labels of the same action share alike."""
-    times = np.bincount(index, minlength=len(lost))
-    by_regret = np.exp(-(lost - lost.min()) / _TEMPERATURE)
-    by_regret /= by_regret.sum()
-    target = (by_regret / np.maximum(times, 1))[index]
-    target /= target.sum()
+def _target(lost: FloatArray, actions: Sequence[Action], index: np.ndarray, chosen: int) -> FloatArray:
+    """Soft targets by regret, and a share for the reference's sensor; labels of the same action share alike.
+
+    Of actions that lose the same, the faster one is to be learned, as :func:`lab.adapter.batches.targets_of` says.
+    """
+    sensors, velocities = np.array(actions)[index].T
+    worth = lost[index] - _WORTH_OF_VELOCITY * velocities
+    times = np.bincount(index, minlength=len(lost))[index]
+
+    def by_regret(own: np.ndarray) -> FloatArray:
+        weights = own * np.exp(-(worth - worth[own].min()).clip(max=15.0) / _TEMPERATURE) / times
+        return np.asarray(weights / weights.sum())
+
+    target = by_regret(np.ones_like(sensors, dtype=bool))
     if chosen >= 0:
-        same = index == index[chosen]
-        target = (1.0 - _REFERENCE_SHARE) * target + _REFERENCE_SHARE * same / same.sum()
+        target = (1.0 - _REFERENCE_SHARE) * target + _REFERENCE_SHARE * by_regret(sensors == sensors[chosen])
     return np.asarray(target)
 
 
