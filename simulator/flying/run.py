@@ -49,7 +49,7 @@ def run_mission(
     if job.edge is None or job.policy != "edge":
         fresh_folder(job.out)
         flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console, _ProgressText(metrics))
-        return _write_results(job, flight, _others(job, flight, console, alive), None, None, {}, console)
+        return _write_results(job, flight, _others(job, job.against, flight, console, alive), None, None, {}, console)
     lossy = radio_link(job.site.scenario, job.seed)
     with (
         job_client(job, job.edge) as ground,
@@ -76,10 +76,9 @@ def run_mission(
             pilot.on_request = requests.append
             flight = _fly(job, pilot, console, progress)
         operator = _operator(probe, job.mission_id, flight)
-        again = None
-        if job.reference and created.mode in LLM_MODES and not flight.interrupted:
-            again = _fly_again(job, job.reference, ground, console)
-        others = _others(job, flight, console, alive)
+        reference = [f"{EDGE_MODE}{job.reference}"] if job.reference and created.mode in LLM_MODES else []
+        others = _others(job, [*reference, *job.against], flight, console, alive)
+        again = others.pop(reference[0], None) if reference else None
     extra = {"operator": operator, "without_llm": None if again is None else sum(t.lost_packets for t in again)}
     code = _write_results(job, flight, others, created.mode, model, extra, console)
     if pilot.last_error is not None:
@@ -161,8 +160,13 @@ def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Fligh
     return flight
 
 
-def _fly_again(job: Job, mode: Mode, edge: EdgeClient, console: Console) -> list[StepTally] | None:
-    """The tallies of the same world flown by the same edge in another mode; ``None`` if that fails."""
+def _fly_again(job: Job, mode: Mode, edge: EdgeClient, console: Console) -> list[StepTally]:
+    """The tallies of the same world flown by the same edge in another mode.
+
+    Raises:
+        EdgeError: the edge refused the mission, or did not decide all of it.
+        KeyboardInterrupt: it was interrupted.
+    """
     from simulator.flying.flight import fly
     from simulator.flying.pilots import EdgePilot
 
@@ -170,27 +174,23 @@ def _fly_again(job: Job, mode: Mode, edge: EdgeClient, console: Console) -> list
     pilot = EdgePilot(edge, mission_id, job.site.scenario, job.seed, mode=mode, deadline_ms=job.deadline_ms)
     with Progress(*_columns(), console=console) as progress:
         task = progress.add_task(f"Flying again, mode {mode}", total=job.site.scenario.steps, text="")
-
-        def stepped(flight: Flight) -> None:
-            progress.advance(task)
-
-        try:
-            edge.put_mission(mission_id, pilot.spec)
-        except EdgeError as error:
-            print(f"mode {mode} was not flown: {error}", file=sys.stderr)
-            return None
-        flight = fly(job.site, pilot, job.seed, on_step=stepped)
-    if flight.interrupted or pilot.answered < len(flight.decisions):
-        return None
+        edge.put_mission(mission_id, pilot.spec)
+        flight = fly(job.site, pilot, job.seed, on_step=lambda _: progress.advance(task))
+    if flight.interrupted:
+        raise KeyboardInterrupt
+    if pilot.answered < len(flight.decisions):
+        raise EdgeError(f"{len(flight.decisions) - pilot.answered} decisions were taken on board, {pilot.last_error}")
     return flight.tally
 
 
-def _others(job: Job, flight: Flight, console: Console, alive: Callable[[], None]) -> dict[str, list[StepTally]]:
-    """The tallies of the policies to compare with, over the steps flown; what fails, or is interrupted, is left out."""
+def _others(
+    job: Job, names: Sequence[str], flight: Flight, console: Console, alive: Callable[[], None]
+) -> dict[str, list[StepTally]]:
+    """The tallies of these policies, over the steps flown, without those that fail and all after an interrupt."""
     from simulator.flying.flight import baselines
 
     flown: dict[str, list[StepTally]] = {}
-    for name in job.against:
+    for name in names:
         try:
             if not name.startswith(EDGE_MODE):
                 flown |= baselines(job.site, job.seed, flight.steps_flown, [name])
@@ -198,7 +198,7 @@ def _others(job: Job, flight: Flight, console: Console, alive: Callable[[], None
                 with job_client(job, job.edge) as edge:
                     await_edge(edge, job.wait_s, console, alive, job.wait_out)
                     tally = _fly_again(job, cast(Mode, name.removeprefix(EDGE_MODE)), edge, console)
-                flown |= {} if tally is None else {name: tally[: flight.steps_flown]}
+                flown[name] = tally[: flight.steps_flown]
         except (EdgeError, ValueError) as error:
             print(f"{name} was not flown: {error}", file=sys.stderr)
         except KeyboardInterrupt:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -118,6 +119,38 @@ def test_a_mode_of_a_running_edge_flies_for_comparison(stub: EdgeStub, tmp_path:
     summary = summary_in(tmp_path)
     assert set(summary.lost_packets) == {"aic_vds", "eof", "wqcs", "edge:policy"}
     assert {spec.mode for spec in stub.missions.values()} == {None, "policy"}
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_an_interrupt_ends_all_comparisons_and_keeps_the_flight(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stub.script, stub.otherwise = ["ok"] * 3, "slow"
+
+    def interrupt() -> None:
+        until(lambda: stub.at_once)
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+    pressed = threading.Thread(target=interrupt)
+    pressed.start()
+    arguments = ["--edge", stub.url, "--against", "edge:policy", "--against", "edge:value", "--steps", "1"]
+    assert simulate.main([*arguments, "--out", str(tmp_path)]) == 0
+    pressed.join()
+    stub.gate.open()
+    assert "edge:policy was not flown to its end: interrupted" in capsys.readouterr().err
+    assert set(summary_in(tmp_path).lost_packets) == {"aic_vds", "eof", "wqcs"}
+    assert {spec.mode for spec in stub.missions.values()} == {None, "policy"}
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_comparison_that_the_edge_did_not_decide_is_left_out_with_its_cause(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stub.script, stub.otherwise = ["ok"] * 3, "invalid"
+    arguments = ["--edge", stub.url, "--against", "edge:policy", "--steps", "1", "--out", str(tmp_path)]
+    assert simulate.main(arguments) == 0
+    assert "edge:policy was not flown: 3 decisions were taken on board" in capsys.readouterr().err
+    assert set(summary_in(tmp_path).lost_packets) == {"aic_vds", "eof", "wqcs"}
 
 
 @pytest.mark.usefixtures("undrawn")
