@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 from shared.client.calls import Exchange
 from shared.client.edge_client import AsyncEdgeClient
-from shared.client.errors import EdgeError, EdgeRefused, EdgeUnreachable
+from shared.client.errors import EdgeError, EdgeRefused
 from shared.wire.missions import MissionStatus
 from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
 from shared.world.scenario import Scenario
@@ -130,7 +130,7 @@ class FieldPilot:
             self.last_error = str(error) or f"no answer within {self._patience_s:g} s"
             # An edge that comes back may have lost the mission.
             self._joined = False
-            return reason_on_board(error if isinstance(error, EdgeError) else EdgeUnreachable(self.last_error))
+            return reason_on_board(error)
         answer = exchange.response
         self._on_board.follow(uav, answer.velocity)
         if outcome is not None and self._pending_outcomes.pop(uav, None) is not None and not answer.stored:

@@ -211,8 +211,10 @@ class EdgePilot:
         self._unstored_outcomes.clear()
 
 
-def reason_on_board(error: EdgeError) -> str:
-    """The reason of a decision on board after this failure of asking the edge."""
-    if isinstance(error, EdgeUnreachable):
+def reason_on_board(error: Exception) -> str:
+    """The reason of a decision on board after this failure of asking the edge; others are of the report itself."""
+    if isinstance(error, EdgeUnreachable | TimeoutError):
         return "edge_unreachable"
-    return "edge_refused" if isinstance(error, EdgeRefused) else "edge_protocol"
+    if isinstance(error, EdgeError):
+        return "edge_refused" if isinstance(error, EdgeRefused) else "edge_protocol"
+    return "report_invalid"

@@ -40,6 +40,7 @@ async def test_a_radio_that_fails_ends_no_flight(edge: Edge) -> None:
     assert flown.steps_flown == 5
     by_step = [[d.source for d in flown.decisions if d.step == step] for step in range(5)]
     assert [sources.count("onboard") for sources in by_step] == [0, 1, 1, 0, 0]
+    assert {d.reason for d in flown.decisions if d.source == "onboard"} == {"report_invalid"}
     assert trial.last_error is not None and "channel_gain" in trial.last_error
     assert [d.failed for d in flown.decisions if d.step == 2] == [True] * 3
     assert {"its radio fails: TimeoutError: no modem", "its radio fails: OSError: no port"} <= {
