@@ -14,14 +14,11 @@ import numpy as np
 
 from lab.claims_map.flights import EVERY_SENSOR, FORMULAS, KEPT, STARTS, Flown, chooser_name
 from lab.experiments.claims import HEURISTICS_ZERO_AT, JAIN, MADQN_ZERO_AT, NEAR_JAIN, NEAR_STEPS, OURS_ZERO_AT
-from lab.experiments.evidence import ZERO
+from lab.experiments.evidence import ZERO, settled_at
 from lab.experiments.intervals import interval, paired
 from lab.experiments.result import Paired
-from shared.world.channel import FloatArray
 from simulator.records.decision import jain_index
 
-# Steps of the moving average, and the fewest that it takes at a mission's end.
-WINDOW, LEAST_REMAINING = 5, 3
 # The paper's initial transient, steps 0 to 3.
 TRANSIENT_STEPS = 4
 BASELINES = ("eof", "wqcs", "madqn_paper", "mappo")
@@ -59,25 +56,9 @@ class MapClaim:
     rule: Callable[[Flights], Held]
 
 
-def settled(means: Sequence[float] | FloatArray) -> int | None:
-    """The step from which on the moving average of a curve stays at ``ZERO`` or less; ``None`` if it does not.
-
-    The average at a step is over it and the four that follow, or those that remain, at least three. One late packet in
-    30 worlds is 0.03 in its step and 0.007 in the average, so it does not reset the statistic; a single step above
-    ``ZERO`` resets ``evidence.settled_at``. This is Welch's procedure for the end of a simulation's initial transient:
-    the mean over replications, then a moving average (P. D. Welch, "The statistical analysis of simulation results", in
-    Lavenberg (ed.), Computer Performance Modeling Handbook, Academic Press, 1983).
-    """
-    curve = np.asarray(means, dtype=float)
-    starts = range(max(0, len(curve) - LEAST_REMAINING + 1))
-    late = [start for start in starts if curve[start : start + WINDOW].mean() > ZERO + 1e-12]
-    at = late[-1] + 1 if late else 0
-    return at if at < len(starts) else None
-
-
 def settled_step(flown: Flown) -> int | None:
     """Where the mean of a scheme's lost packets over worlds settles."""
-    return settled(flown.lost.mean(axis=0))
+    return settled_at(flown.lost.mean(axis=0))
 
 
 def _worlds(flown: Flown) -> list[float]:

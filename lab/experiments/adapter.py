@@ -8,13 +8,13 @@ from lab.experiments.schemes import (
     ADAPTED,
     CHANCE,
     Scheme,
+    adapted_chance,
     adapted_llm,
     at_full_speed,
     available_locals,
     edge_planner,
     guided,
     llm,
-    over_edge,
     value,
 )
 
@@ -25,7 +25,7 @@ def _schemes(setup: Setup) -> list[Scheme]:
     return [
         adapted_llm(),
         llm(),
-        over_edge("llm_chance", "uniform draws in place of an LLM", backing=CHANCE),
+        adapted_chance(),
         guided("guided_adapted", "guided, with the adapter", backing=ADAPTED),
         guided("guided_alone_adapted", "guided, no planner, with the adapter", planner="off", backing=ADAPTED),
         guided("guided_alone_chance", "guided, no planner, LLM draws", planner="off", backing=CHANCE),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from lab.experiments.measures import LOSS_CURVES, LOSSES
 from lab.experiments.plan import Experiment, FigureSpec, Setup
 from lab.experiments.result import Sweep
-from lab.experiments.schemes import CHANCE, Scheme, adapted_llm, available_locals, over_edge
+from lab.experiments.schemes import Scheme, adapted_chance, adapted_llm, available_locals
 
 _TOP_K = 5
 _OTHER_KS = (1, 2, 3, 7, 10)
@@ -20,7 +20,7 @@ def _schemes(setup: Setup) -> list[Scheme]:
         _adapted("llm", f"k = {_TOP_K}"),
         *(_adapted(f"k{k}", f"k = {k}", top_k=k) for k in _OTHER_KS),
         _adapted("llm_all", "no attention", attention="off"),
-        over_edge("llm_chance", "uniform draws in place of an LLM", backing=CHANCE),
+        adapted_chance(),
         *available_locals("eof", "wqcs", "madqn_paper", "mappo", "random"),
     ]
 

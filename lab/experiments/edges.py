@@ -14,7 +14,7 @@ from pathlib import Path
 import httpx
 from rich.console import Console
 
-from lab.experiments.schemes import ADAPTED, CHANCE, NAMED_BY_OPTION, OFF, WORST, Backing
+from lab.experiments.schemes import ADAPTED, CHANCE_AS_ADAPTED, NAMED_BY_OPTION, OFF, STAND_INS, WORST, Backing
 from lab.experiments.stand_ins import answering, drawn, worst
 from shared.client.edge_client import API_KEY, EdgeClient
 from shared.client.errors import EdgeError
@@ -57,7 +57,7 @@ class Llm:
 
     def identity(self, backing: Backing) -> str:
         """The LLM in a flight's key; LLMs of one identity answer alike."""
-        if backing in (OFF, CHANCE, WORST):
+        if backing in (OFF, *STAND_INS):
             return backing
         if backing == NAMED_BY_OPTION:
             if self.edge is not None:
@@ -114,9 +114,10 @@ def environment_for(backing: Backing, llm: Llm) -> Iterator[Mapping[str, str]]:
     base[_ADAPTER] = "off"
     if backing == OFF:
         yield base | {"AICVDS_MODE": "value"}
-    elif backing in (CHANCE, WORST):
-        with answering(drawn if backing == CHANCE else worst) as url:
-            yield base | {"AICVDS_LLM_URL": url}
+    elif backing in STAND_INS:
+        with answering(worst if backing == WORST else drawn) as url:
+            adapter = {_ADAPTER: "served"} if backing == CHANCE_AS_ADAPTED else {}
+            yield base | adapter | {"AICVDS_LLM_URL": url}
     elif backing == ADAPTED:
         yield base | {_ADAPTER: str(_adapter())}
     elif backing != NAMED_BY_OPTION:

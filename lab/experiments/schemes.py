@@ -14,10 +14,11 @@ from simulator.records.decision import Record
 # So long that the speed of this machine does not change an edge's decisions.
 GENEROUS_DEADLINE_MS = 30_000
 
-# The LLM behind an edge: none, that of --llm, the embedded one with its adapter, uniform draws, the worst of the
-# candidates, or a model file by its path.
+# The LLM behind an edge: none, that of --llm, the embedded one with its adapter, uniform draws, uniform draws of the
+# answers that the adapter's prompt allows, the worst of the candidates, or a model file by its path.
 Backing = str
-OFF, NAMED_BY_OPTION, ADAPTED, CHANCE, WORST = "off", "asked", "adapted", "chance", "worst"
+OFF, NAMED_BY_OPTION, ADAPTED = "off", "asked", "adapted"
+CHANCE, CHANCE_AS_ADAPTED, WORST = STAND_INS = "chance", "chance as adapted", "worst"
 
 
 class Local(Record):
@@ -32,10 +33,10 @@ class OverEdge(Record):
     """An edge over HTTP. ``spec`` is its mission's, without scenario and seed.
 
     ``backing`` is ``off`` (no LLM), ``asked`` (the LLM of ``--llm``), ``adapted`` (the embedded LLM with the adapter of
-    ``AICVDS_LLM_ADAPTER``, by default the package's), ``chance`` (an LLM that answers uniform draws), ``worst`` (the
-    emptiest queue at the highest velocity) or a GGUF file's path. ``deadline_ms`` of ``None`` is the
-    edge's default. ``operator`` guides the fleet, if set. With ``sensor_uplinks`` some sensors report to the edge
-    themselves.
+    ``AICVDS_LLM_ADAPTER``, by default the package's), ``chance`` (an LLM that answers uniform draws), ``chance as
+    adapted`` (one that gets the adapter's prompt), ``worst`` (the emptiest queue at the highest velocity) or a GGUF
+    file's path. ``deadline_ms`` of ``None`` is the edge's default. ``operator`` guides the fleet, if set. With
+    ``sensor_uplinks`` some sensors report to the edge themselves.
     """
 
     kind: Literal["edge"] = "edge"
@@ -74,7 +75,7 @@ class Scheme(Record):
     @property
     def asks_llm(self) -> bool:
         """Whether its flights query a real LLM."""
-        return self.is_answered and not (isinstance(self.decides, OverEdge) and self.decides.backing in (CHANCE, WORST))
+        return self.is_answered and not (isinstance(self.decides, OverEdge) and self.decides.backing in STAND_INS)
 
 
 PLANNER, FORMULA_PLANNER = "mpc", "mpc_formula"
@@ -156,7 +157,12 @@ def llm() -> Scheme:
 
 def adapted_llm(name: str = "llm_adapted", label: str = "mode llm, with the adapter", **options: Any) -> Scheme:
     """The embedded LLM with its adapter; neither planner nor verifier takes part."""
-    return over_edge(name, label, backing=ADAPTED, verify="off", planner="off", **options)
+    return over_edge(name, label, **{"backing": ADAPTED, "verify": "off", "planner": "off"} | options)
+
+
+def adapted_chance() -> Scheme:
+    """Uniform draws of the answers between which the LLM with its adapter chooses, from the same prompts."""
+    return adapted_llm("llm_chance", "uniform draws in place of the LLM with its adapter", backing=CHANCE_AS_ADAPTED)
 
 
 def guided(name: str = "guided", label: str = "AIC-VDS, mode guided", **spec: Any) -> Scheme:

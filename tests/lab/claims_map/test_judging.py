@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from lab.claims_map.flights import SCHEMES, Flown
-from lab.claims_map.judging import CLAIMS, judge, most_held, settled
-from lab.experiments.evidence import settled_at
+from lab.claims_map.judging import CLAIMS, judge, most_held
 
 STEPS, WORLDS = 30, 6
 
@@ -36,28 +35,6 @@ AS_THE_PAPER_SAYS = flights(
     look_ahead_random_k3=[9] * 8,
     look_ahead_shipped_k3=[9] * 8,
 )
-
-
-@pytest.mark.parametrize(
-    ("curve", "step"),
-    [
-        ([0.0] * 30, 0),
-        ([5.0, 3.0, 1.0, 0.2] + [0.0] * 26, 3),
-        ([0.0] * 10 + [1.0] * 2 + [0.0] * 18, 12),
-        ([1.0] * 27 + [0.0] * 3, 27),
-        ([1.0] * 28 + [0.0] * 2, None),
-        ([0.0] * 20 + [0.3] * 10, None),
-    ],
-)
-def test_the_step_at_which_a_curve_settles(curve: list[float], step: int | None) -> None:
-    assert settled(curve) == step
-
-
-def test_one_late_packet_does_not_reset_it() -> None:
-    # In one of twelve worlds, at step 20.
-    curve = [5.0, 3.0, 1.0, 0.2] + [0.0] * 16 + [1 / 12] + [0.0] * 9
-    assert settled(curve) == 3
-    assert settled_at(curve) == 21
 
 
 def test_every_claim_but_those_on_totals_and_visits_holds_where_losses_are_as_the_paper_says() -> None:

@@ -42,6 +42,13 @@ def attended(llm: float, llm_all: float) -> Result:
     return result("attention", {"llm": {"lost_packets": noisy}, "llm_all": {"lost_packets": without}})
 
 
+def beside_unattended(kept: float) -> Result:
+    """A compact prompt that keeps so many of 100 tokens, and by the edge's account saves half of the paper's rows."""
+    saved = {"prompt_saved_pct": 50.0, "state_saved_pct": 50.0}
+    sent = {"prompt_tokens": 100.0, "state_tokens": 100.0}
+    return result("tokens", {"llm": {name: kept for name in sent} | saved, "llm_all": sent | saved})
+
+
 def tokens(prompt: float, state: float) -> Result:
     counts = {"prompt_uncompressed": 200.0, "prompt_tokens": 150.0, "state_uncompressed": 80.0, "state_tokens": 40.0}
     return result("tokens", {"llm": {"prompt_saved_pct": prompt, "state_saved_pct": state, **counts}})
@@ -71,6 +78,9 @@ def fair(served: float, scheduled: float) -> Result:
         ("halves the prompt", tokens(25.0, 50.0), NOT),
         ("only the state block", tokens(25.0, 50.0), REPRODUCED),
         ("only the state block", tokens(25.0, 30.0), NOT),
+        ("halves the prompt", beside_unattended(50.0), REPRODUCED),
+        ("halves the prompt", beside_unattended(60.0), NOT),
+        ("only the state block", beside_unattended(60.0), NOT),
         ("213.7 tokens become 106.8", tokens(50.0, 50.0), APART),
         ("Jain's index", fair(0.985, 0.979), REPRODUCED),
         ("Jain's index", fair(0.87, 0.91), NOT),
@@ -172,10 +182,25 @@ def test_a_verdict_on_few_seeds_is_marked() -> None:
     assert not finding("EOF reaches zero", made).few_seeds
 
 
-def test_losses_are_settled_where_they_stay_near_zero() -> None:
-    assert settled_at([3.0, 0.0, 1.0, 0.04, 0.0]) == 3
-    assert settled_at([0.0, 0.0]) == 0
-    assert settled_at([0.0, 0.06]) is None
+@pytest.mark.parametrize(
+    ("curve", "step"),
+    [
+        ([0.0] * 30, 0),
+        ([5.0, 3.0, 1.0, 0.2] + [0.0] * 26, 3),
+        ([0.0] * 10 + [1.0] * 2 + [0.0] * 18, 12),
+        ([1.0] * 27 + [0.0] * 3, 27),
+        ([1.0] * 28 + [0.0] * 2, None),
+        ([0.0] * 20 + [0.3] * 10, None),
+    ],
+)
+def test_the_step_at_which_a_curve_settles(curve: list[float], step: int | None) -> None:
+    assert settled_at(curve) == step
+
+
+def test_one_late_packet_does_not_reset_it() -> None:
+    # In one of twelve worlds, at step 20.
+    curve = [5.0, 3.0, 1.0, 0.2] + [0.0] * 16 + [1 / 12] + [0.0] * 9
+    assert settled_at(curve) == 3
 
 
 def test_pairs_are_of_the_worlds_that_both_flew() -> None:
