@@ -45,7 +45,7 @@ class Broker(_Table):
         wrong = "must be mqtt://host or mqtts://host (TLS), with a port from 1 to 65535 if it is not the usual one"
         try:
             parsed = urlsplit(url)
-            port = parsed.port
+            port, _ = parsed.port, (parsed.hostname or "").encode("idna")
         except ValueError:
             raise ValueError(wrong) from None
         plain = parsed.hostname and "@" not in url and not (parsed.path or parsed.query or parsed.fragment)

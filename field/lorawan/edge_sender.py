@@ -55,8 +55,7 @@ class EdgeSender:
 
     def send_pending(self) -> float:
         """Send all buffered readings once; returns the seconds to wait before the next call."""
-        now = time.monotonic()
-        due = self._pending.drain()
+        now, due = time.monotonic(), self._pending.drain()
         try:
             while due:
                 mission_id, readings = next(iter(due.items()))
@@ -68,8 +67,8 @@ class EdgeSender:
                     self._pause_s = 0.0
                 del due[mission_id]
         except EdgeError as error:
-            # The edge counts those that it already has as duplicates.
-            for unsent in due.values():
+            # The edge counts those that it already has as duplicates. The mission that failed is the next call's last.
+            for unsent in (*list(due.values())[1:], due[mission_id]):
                 self._pending.put_back(unsent)
             self._metrics.failures.inc()
             self._pause_s = min(max(_FIRST_PAUSE_S, 2 * self._pause_s), _LONGEST_PAUSE_S)
@@ -78,21 +77,23 @@ class EdgeSender:
         return _FIRST_PAUSE_S
 
     def _send(self, mission_id: str, readings: Sequence[PendingReading]) -> None:
-        """Send readings of one mission, one by one where the edge refuses them together; raises ``EdgeError``."""
+        """Send readings of one mission, in halves where the edge refuses them together; raises ``EdgeError``."""
         body = ReadingsRequest(readings=[_to_wire(reading) for reading in readings])
         try:
             answer = self._client.send_readings(mission_id, body)
         except EdgeRefused as refused:
             # 409: the edge cannot load the mission from its store; only deleting the mission cures that.
             if refused.status in (404, 409):
+                level = logging.DEBUG if mission_id in self._retry_at else logging.WARNING
+                log.log(level, "the readings of mission %s wait: %s", mission_id, refused.detail)
                 self._put_back(mission_id, readings, "no_mission")
             elif refused.status not in _PERMANENT_STATUS:
                 raise
             elif len(readings) == 1:
                 self._count_refused(readings[0], refused)
             else:
-                for reading in readings:
-                    self._send(mission_id, [reading])
+                for half in (readings[: len(readings) // 2], readings[len(readings) // 2 :]):
+                    self._send(mission_id, half)
         else:
             self._count_results(mission_id, readings, answer.results)
 
@@ -101,8 +102,7 @@ class EdgeSender:
     ) -> None:
         if len(results) != len(readings):
             raise EdgeProtocolError("the answer has no result for each reading: is that an AIC-VDS edge?")
-        early = []
-        now = datetime.now(UTC)
+        early, now = list[PendingReading](), datetime.now(UTC)
         for reading, result in zip(readings, results, strict=True):
             if result == "early":
                 early.append(reading)
@@ -128,11 +128,11 @@ class EdgeSender:
 
 
 def _to_wire(reading: PendingReading) -> SensorReading:
-    age_s = (datetime.now(UTC) - reading.at).total_seconds()
     return SensorReading(
         sensor_id=reading.sensor_id,
-        queue=min(reading.queue, 100_000.0),
+        # A full queue times a unit that is no binary fraction is a little more than the capacity.
+        queue=min(round(reading.queue, 6), 100_000.0),
         battery=reading.battery,
-        age_s=min(max(0.0, age_s), MAX_AGE_S),
+        age_s=min(max(0.0, (datetime.now(UTC) - reading.at).total_seconds()), MAX_AGE_S),
         message_id=reading.message_id,
     )

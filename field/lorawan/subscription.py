@@ -103,9 +103,7 @@ class Subscription:
 
     def _received(self, client: Client, _: Any, message: MQTTMessage) -> None:
         try:
-            result = self._pending.add_message(bytes(message.payload), topic=message.topic)
+            log.debug("%s: %s", message.topic, self._pending.add_message(bytes(message.payload), topic=message.topic))
         except Exception:
             # An error would end the client's thread, and no further message would come.
-            log.exception("a message of %s could not be processed", message.topic)
-            return
-        log.debug("%s: %s", message.topic, result)
+            log.exception("a message could not be processed")

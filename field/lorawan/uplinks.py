@@ -72,10 +72,11 @@ class _Battery(BaseModel):
 
 
 class _ChirpStack(BaseModel):
-    """``UplinkEvent`` or ``StatusEvent``."""
+    """``StatusEvent``, or ``UplinkEvent``: its ``time`` is by any gateway's clock, ``ns_time`` by the server's."""
 
     deduplication_id: _Text = Field(None, alias="deduplicationId")
     time: AwareDatetime
+    ns_time: _Optional[AwareDatetime] = Field(None, validation_alias=AliasPath("rxInfo", 0, "nsTime"))
     tenant_id: _Text = Field(None, validation_alias=AliasPath("deviceInfo", "tenantId"))
     application_id: str = Field(validation_alias=AliasPath("deviceInfo", "applicationId"))
     dev_eui: _Eui = Field(validation_alias=AliasPath("deviceInfo", "devEui"))
@@ -119,7 +120,7 @@ def chirpstack(payload: bytes) -> DeviceMessage:
         tenant=event.tenant_id or None,
         application=event.application_id,
         message_id=_message_id(event.dev_eui, event.deduplication_id or event.f_cnt or 0, event.time),
-        at=event.time,
+        at=event.ns_time or event.time,
         fields={} if event.object is None and not is_status else event.object,
         has_battery=is_status,
         battery_percent=None if unknown else event.battery_level,

@@ -201,11 +201,11 @@ class FieldFlight:
             self._on_event(uav.index, str(error))
 
     async def _received(self, uav: FieldUav, receiving: Awaitable[T], nothing: T) -> T:
-        """What a radio receives; nothing where it fails, whatever a user's radio raises."""
+        """What a radio receives; nothing where it fails, whatever it raises, or takes longer than a step."""
         try:
-            return await receiving
+            return await asyncio.wait_for(receiving, self._scenario.step_s)
         except Exception as error:
-            self._on_event(uav.index, f"its radio fails: {type(error).__name__}: {error}")
+            self._on_event(uav.index, f"its radio fails: {type(error).__name__}: {error}".removesuffix(": "))
             return nothing
 
     async def _collect(self, legs: Sequence[_Leg], step: int) -> None:

@@ -269,8 +269,8 @@ class FieldUav:
             return NO_POSITION
         if state.armed is None:
             return NO_TELEMETRY
-        if not state.armed or state.mode in _ENDS:
-            self.landed = True
+        self.landed = not state.armed or state.mode in _ENDS
+        if self.landed:
             return _ENDS[state.mode] if state.armed else "it is not armed"
         if state.mode != "mission" and not (state.mode == "hold" and (self.waits or self._mode_is_old)):
             # The pilot who flies it now decides when its mission goes on.

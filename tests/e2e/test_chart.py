@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +141,27 @@ def test_numbers_and_switches_arrive_as_the_edge_writes_them(tmp_path: Path) -> 
         "AICVDS_MAX_BODY_BYTES": "2000000",
         "AICVDS_LEARNING_RATE": "0.0005",
     }
+
+
+def test_opentelemetrys_switches_are_its_own_words(tmp_path: Path) -> None:
+    settings = {"AICVDS_ANONYMOUS": True, "OTEL_SDK_DISABLED": True}
+    assert environment(rendered(tmp_path, SMALL | {"settings": settings}))["OTEL_SDK_DISABLED"] == "true"
+
+
+@pytest.mark.parametrize("tag", ["1.2.3@sha256:" + "0123456789abcdef" * 4, "v" * 100])
+def test_whatever_the_tag_the_labels_are_labels(tmp_path: Path, tag: str) -> None:
+    for one in rendered(tmp_path, SMALL | {"image": {"tag": tag}}).values():
+        for value in one["metadata"]["labels"].values():
+            assert re.fullmatch(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,61}[A-Za-z0-9])?", value)
+
+
+def test_headers_with_a_key_come_from_a_secret_and_an_upgrade_may_end_all_edges(tmp_path: Path) -> None:
+    secret = {"AICVDS_LLM_EXTRA_HEADERS": {"name": "aicvds", "key": "headers"}}
+    edges = rendered(tmp_path, LARGE | {"secretSettings": secret, "replicas": 0})["StatefulSet", "fleet-aicvds"]
+    assert edges["spec"]["replicas"] == 0
+    [edge] = edges["spec"]["template"]["spec"]["containers"]
+    [found] = [one for one in edge["env"] if one["name"] == "AICVDS_LLM_EXTRA_HEADERS"]
+    assert found["valueFrom"]["secretKeyRef"] == {"name": "aicvds", "key": "headers"}
 
 
 def test_the_schema_lists_every_setting() -> None:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import re
 
+import httpx
 import pytest
 import yaml
+from starlette.responses import Response
 
+from service.api.authentication import KnownHosts
+from service.config.settings import Settings
 from tests.support.places import ROOT
 
 TEXT = (ROOT / "docker-compose.yml").read_text()
@@ -64,5 +68,21 @@ def test_a_service_is_of_one_version_and_sees_no_more_than_it_needs(name: str) -
 def test_prometheus_scrapes_where_the_containers_listen() -> None:
     config = yaml.safe_load((ROOT / "docker" / "prometheus.yml").read_text())
     targets = {job["static_configs"][0]["targets"][0] for job in config["scrape_configs"]}
-    port = next(word.split("=")[1] for word in SERVICES["simulator"]["command"] if word.startswith("--metrics-port="))
-    assert targets == {"edge:8000", f"simulator:{port}"}
+    ports = {
+        f"{name}:{word.split('=')[1]}"
+        for name, service in SERVICES.items()
+        for word in service.get("command", ())
+        if word.startswith("--metrics-port=")
+    }
+    assert targets == {"edge:8000", *ports} and len(ports) == 2
+
+
+@pytest.mark.parametrize("own", ["", "fleet.example.org", "*"])
+async def test_an_operators_names_add_to_the_containers_own(own: str) -> None:
+    [line] = [line for line in SERVICES["edge"]["environment"] if line.startswith("AICVDS_HOSTS=")]
+    hosts = line.partition("=")[2].replace("${AICVDS_HOSTS:-}", own)
+    edge = KnownHosts(Response(status_code=204), Settings(hosts=hosts, store="none"))
+    async with httpx.AsyncClient(transport=httpx.ASGITransport(edge)) as client:
+        names = ("edge:8000", "fleet.example.org")
+        found = [(await client.get(f"http://{name}/")).status_code for name in names]
+    assert found == [204, 204 if own else 403]

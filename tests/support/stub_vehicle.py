@@ -32,7 +32,7 @@ class StubVehicle:
 
     Attributes:
         commands: every command.
-        lands_at_s: from then on it lands.
+        lands_at_s, flies_on_at_s: from the first to the second time it lands.
         top: its highest ground speed, m/s, whatever it acknowledges.
         shift_m: how far north of its path it reports itself.
         battery_percent: as it reports.
@@ -41,7 +41,7 @@ class StubVehicle:
     def __init__(self, site: Site, uav: int, clock: SimulatedClock, wind: float = 1.0) -> None:
         self.name = f"stub {uav}"
         self.commands: list[str | float] = []
-        self.lands_at_s = self.top = float("inf")
+        self.lands_at_s = self.flies_on_at_s = self.top = float("inf")
         self.shift_m = 0.0
         self.battery_percent: float | None = None
         self.deaf = self.waits_in_mission = False
@@ -59,7 +59,8 @@ class StubVehicle:
         speed = self._ground_speed if self.mode == "mission" else 0.0
         state = VehicleState(True, True, self.mode, (longitude, latitude), 100.0, speed_m_s=speed)
         state = replace(state, battery_percent=self.battery_percent)
-        return replace(state, mode="landing") if self._clock.now() >= self.lands_at_s else state
+        landing = self.lands_at_s <= self._clock.now() < self.flies_on_at_s
+        return replace(state, mode="landing") if landing else state
 
     async def mission(self) -> list[MissionItem]:
         """None."""

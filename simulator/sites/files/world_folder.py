@@ -141,7 +141,7 @@ def _fences(survey: Survey, path: Path, frame: Frame, routes: Sequence[Sequence[
             raise UsageError(f"{path}, {label}: the fence is more than {MAX_AREA_M / 500:,.0f} km away; draw it nearer")
         apart = np.abs(np.diff(np.array(drawn.points), axis=0))[:, 0]
         polar = np.abs([latitude for _, latitude in drawn.points[1:]]) > _POLAR
-        if (apart > np.where(polar, 180.0, 359.0)).any():
+        if (apart > np.where(polar, 180.0, 359.999999)).any():
             raise UsageError(f"{path}, {label}: an edge goes around the Earth; give it corners that are nearer")
         fence = Fence(drawn.role, _points(frame.metres(frame.bent(drawn.points))), drawn.radius, drawn.name)
         for of, route in zip(survey.trajectories, routes, strict=True):

@@ -46,7 +46,7 @@ def beside_unattended(kept: float) -> Result:
     """A compact prompt that keeps so many of 100 tokens, and by the edge's account saves half of the paper's rows."""
     saved = {"prompt_saved_pct": 50.0, "state_saved_pct": 50.0}
     sent = {"prompt_tokens": 100.0, "state_tokens": 100.0}
-    return result("tokens", {"llm": {name: kept for name in sent} | saved, "llm_all": sent | saved})
+    return result("tokens", {"llm": dict.fromkeys(sent, kept) | saved, "llm_all": sent | saved})
 
 
 def tokens(prompt: float, state: float) -> Result:

@@ -71,6 +71,8 @@ def test_an_address_has_the_usual_port_unless_it_names_one(tmp_path: Path, url: 
         ("mqtt://localhost", "http://localhost", "broker.url: must be mqtt://host"),
         ("mqtt://localhost", "mqtt://me:secret@localhost", "broker.url: must be mqtt://host"),
         ("mqtt://localhost", "mqtt://localhost:70000", "broker.url: must be mqtt://host"),
+        ("mqtt://localhost", "mqtt://broker..example", "broker.url: must be mqtt://host"),
+        ("mqtt://localhost", f"mqtt://{'b' * 64}.example", "broker.url: must be mqtt://host"),
         ('"chirpstack"', '"chirp"', "network.server: "),
         ('application = "ae', 'application = "+/ae', "network.application: "),
         ('queue = "queue"', 'queue = ""', "payload.queue: "),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -148,3 +150,60 @@ def test_an_answer_of_something_else_loses_nothing(answer: httpx.Response) -> No
     pending = taken()
     edge_sender(pending, handler=lambda request: answer).send_pending()
     assert len(waiting(pending)) == 1
+
+
+def test_a_mission_that_cannot_be_reached_keeps_no_other_back() -> None:
+    def edges(request: httpx.Request) -> httpx.Response:
+        if "/missions/default/" in request.url.path:
+            raise httpx.ConnectError("the owner cannot be reached")
+        return httpx.Response(200, json={"results": ["merged"], "step": 3})
+
+    pending = taken()
+    for reading in waiting(pending):
+        pending.put_back([reading, replace(reading, mission_id="south")])
+    sender = edge_sender(pending, handler=edges)
+    assert [sender.send_pending() for _ in range(2)] == [1.0, 1.0]
+    assert counted(pending) == {"merged": 1}
+    assert [reading.mission_id for reading in waiting(pending)] == ["default"]
+
+
+def test_one_refused_reading_costs_few_requests() -> None:
+    asked: list[int] = []
+
+    def edge(request: httpx.Request) -> httpx.Response:
+        sensors = [reading["sensor_id"] for reading in json.loads(request.content)["readings"]]
+        asked.append(len(sensors))
+        if 77 in sensors:
+            return httpx.Response(422, json={"title": "no", "status": 422, "detail": "sensor 77: unknown"})
+        return httpx.Response(200, json={"results": ["merged"] * len(sensors), "step": 3})
+
+    pending = taken()
+    [reading] = waiting(pending)
+    pending.put_back([replace(reading, sensor_id=sensor) for sensor in range(100)])
+    edge_sender(pending, handler=edge).send_pending()
+    assert counted(pending) == {"merged": 99, "refused": 1}
+    assert len(asked) <= 2 * 7 + 1
+
+
+def test_readings_of_an_unknown_mission_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    problem = {"title": "no", "status": 404, "detail": "mission_id: unknown"}
+    pending = taken()
+    sender = edge_sender(pending, handler=lambda request: httpx.Response(404, json=problem), retry_s=0.0)
+    for _ in range(3):
+        sender.send_pending()
+    assert [record.message for record in caplog.records if record.levelname == "WARNING"] == [
+        "the readings of mission default wait: mission_id: unknown"
+    ]
+
+
+@pytest.mark.parametrize("capacity", [28, 55, 110])
+def test_a_full_queue_is_the_capacity(capacity: int) -> None:
+    sent: list[float] = []
+
+    def edge(request: httpx.Request) -> httpx.Response:
+        sent.extend(reading["queue"] for reading in json.loads(request.content)["readings"])
+        return httpx.Response(200, json={"results": ["merged"], "step": 3})
+
+    pending = taken(queue=100.0, into=reading_buffer(packets_per_unit=capacity / 100))
+    edge_sender(pending, handler=edge).send_pending()
+    assert sent == [capacity]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -46,6 +48,25 @@ async def test_a_radio_that_fails_ends_no_flight(edge: Edge) -> None:
     assert {"its radio fails: TimeoutError: no modem", "its radio fails: OSError: no port"} <= {
         text for _, text in trial.events
     }
+
+
+class Silent(Counting):
+    """From step 1 on the first UAV's receiver never answers."""
+
+    async def beacons(self, spot: Spot) -> dict[int, Beacon]:
+        if spot.step > 0 and spot.uav == 0:
+            await asyncio.Event().wait()
+        return {0: Beacon(30, 40.0, -90.0, 0)}
+
+
+async def test_a_radio_that_never_answers_stops_no_flight() -> None:
+    trial = Trial(steps=3)
+    scenario = trial.site.scenario.model_copy(update={"step_s": 0.05})
+    trial.site = replace(trial.site, scenario=scenario)
+    trial.radio = Silent([])
+    flown = await trial.fly(nobody(), attempts=1)
+    assert flown.steps_flown == 3 and len([d for d in flown.decisions if d.uav_id != 0]) == 6
+    assert (0, "its radio fails: TimeoutError") in trial.events
 
 
 async def test_an_outcome_that_is_refused_at_landing_keeps_no_other_back() -> None:

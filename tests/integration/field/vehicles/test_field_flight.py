@@ -270,6 +270,16 @@ async def test_a_uav_that_lands_gets_no_more_commands_and_the_others_fly_on() ->
     assert len([d for d in flown.decisions if d.uav_id != 1]) == 2 * STEPS
 
 
+async def test_a_uav_that_flies_on_after_landing_is_commanded_to_the_end() -> None:
+    trial = Trial()
+    trial.vehicles[1].lands_at_s, trial.vehicles[1].flies_on_at_s = 35.0, 45.0
+    trial.vehicles[2].lands_at_s, trial.vehicles[2].flies_on_at_s = 55.0, 65.0
+    trial.vehicles[0].lands_at_s = 75.0
+    flown = await trial.fly(nobody(), attempts=1)
+    assert flown.steps_flown == STEPS and flown.ended == {0: "it lands"}
+    assert [d.step for d in flown.decisions if d.uav_id == 1] == [0, 1, 2, 3, *range(5, STEPS)]
+
+
 async def test_a_uav_off_its_path_or_outside_the_fence_gets_no_command() -> None:
     trial = Trial()
     trial.vehicles[0].shift_m = 150.0

@@ -22,6 +22,7 @@ from tests.support.lorawan_messages import (
     chirpstack_up,
     dev_eui,
     packed,
+    rfc3339,
     the_things_stack_up,
 )
 
@@ -129,6 +130,21 @@ def test_an_older_message_that_comes_later_does_not_replace_the_newer_one() -> N
     assert take(pending, chirpstack_up(queue=30, f_cnt=2)) == "accepted"
     assert take(pending, chirpstack_up(queue=10, f_cnt=1, at=NOW - timedelta(seconds=20))) == "outdated"
     assert [reading.queue for reading in waiting(pending)] == [30.0]
+
+
+def test_gateways_with_wrong_clocks_make_no_reading_outdated() -> None:
+    pending = reading_buffer()
+    for f_cnt in range(1, 7):
+        at = NOW + timedelta(seconds=10 * f_cnt)
+        # Every other uplink comes first through a gateway whose clock is ahead.
+        ahead = timedelta(seconds=45 * (f_cnt % 2))
+        message = chirpstack_up(f_cnt=f_cnt, at=at + ahead, rxInfo=[{"nsTime": rfc3339(at)}])
+        assert take(pending, message, 10 * f_cnt + 1.0) == "accepted"
+
+
+@pytest.mark.parametrize("received", [None, [], {}, [{}], [{"nsTime": None}], [{"nsTime": "soon"}], [5]])
+def test_without_the_servers_time_the_events_counts(received: object) -> None:
+    assert chirpstack(packed(chirpstack_up(rxInfo=received))).at == chirpstack(packed(chirpstack_up())).at
 
 
 def test_a_frame_counter_that_begins_again_is_no_duplicate() -> None:

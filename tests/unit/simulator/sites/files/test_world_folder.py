@@ -192,6 +192,14 @@ def test_a_fence_is_straight_in_degrees_too(tmp_path: Path) -> None:
         )
 
 
+@pytest.mark.parametrize("east", [-179.99, -180.0, -178.8])
+def test_a_fence_across_the_antimeridian_is_a_fence(tmp_path: Path, east: float) -> None:
+    ring = [[179.99, -17.02], [east, -17.02], [east, -16.98], [179.99, -16.98], [179.99, -17.02]]
+    line = there_and_back([179.992, -17.0], [179.996, -17.0])
+    area = feature("fence", "Polygon", [ring])
+    assert len(site_from_folder(write(tmp_path, sensor("a", 179.994, -17.0), line, area)).fences) == 1
+
+
 @pytest.mark.parametrize(
     ("ring", "complaint"),
     [
