@@ -207,13 +207,17 @@ class AttendedState:
                 approach=self.state.approaches([row], self.mission.scenario)[0],
                 velocity=velocity,
             )
+        if row is None or not self.state.heard[row]:
+            seen = self.mission.template.unreported_row(sensor_id)
+        else:
+            seen = cells(self.state, [row])[0]
         return Pending(
             decision_id=decision_id,
             uav_id=self.uav_id,
             step=self.step,
             sensor_id=sensor_id,
             velocity=velocity,
-            seen=self.mission.template.unreported_row(sensor_id) if row is None else cells(self.state, [row])[0],
+            seen=seen,
             sample=sample,
         )
 

@@ -17,7 +17,7 @@ The weights and their guarantee are in :mod:`service.learning.trust`; the evalua
 """
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Self
 
@@ -213,13 +213,9 @@ def template_of(mission: Mission) -> GuidedTemplate:
 
 def candidates_of(state: AttendedState, template: GuidedTemplate) -> CandidateSet:
     """The LLM's candidates, at velocities that the operator allows; the state has at least one row."""
-    mission = state.mission
+    mission, shown = state.mission, state.prompt_view
     view = Viewpoint(mission.belief, state.uav_id, state.step, learned=mission.belief_source == "fleet")
-    shown = state.prompt_view
+    if shown.guidance is not None:
+        view = replace(view, nearest=shown.guidance.nearest)
     seen, offered = shown.reach or state.reach, shown.offered or state.reach
-    candidates = template.candidates(shown.state, seen, offered, state.shown(), view)
-    guidance = shown.guidance
-    if guidance is None:
-        return candidates
-    rows = {int(sensor): row for row, sensor in enumerate(state.state.ids)}
-    return candidates.with_velocities(lambda sensor, velocity: guidance.nearest(rows[sensor], velocity))
+    return template.candidates(shown.state, seen, offered, state.shown(), view)

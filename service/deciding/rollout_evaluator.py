@@ -309,9 +309,6 @@ def evaluate(state: RolloutState, candidates: Sequence[Action]) -> Evaluation:
     scenario, sensors, count = state.scenario, len(state.sensors), len(candidates)
     if not sensors:
         return Evaluation(np.zeros(count), np.ones(count))
-    # Only mode ``guided`` needs the compiled flights.
-    from service.deciding.rollout_evaluator import FlownWorld, fly_candidates
-
     uavs = list(state.links)
     plans = {uavs.index(uav): actions for uav, actions in state.plans.items()}
     continuations = [{}, plans] if plans else [{}]

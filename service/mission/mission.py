@@ -29,7 +29,7 @@ from service.mission.events import (
     ignore_event,
 )
 from service.mission.idempotency import IdempotentAnswers
-from service.mission.planner import MAX_SENSORS, MAX_UAVS, MissionPlanner
+from service.mission.planner import MAX_CAPACITY, MAX_SENSORS, MAX_UAVS, MissionPlanner
 from service.mission.prompt_fit import PromptFit, template_for
 from service.mission.reports import Reports
 from service.mission.resolved_spec import ResolvedSpec
@@ -107,7 +107,8 @@ class Mission:
         self.measured: dict[int, Measured] = {}
         self.reports = Reports(mission_id, self.scenario, self.belief, self.pending)
         self.readings = Readings(self.scenario, self.belief, self.records)
-        small = self.scenario.sensors <= MAX_SENSORS and self.scenario.uavs <= MAX_UAVS
+        world = self.scenario
+        small = world.sensors <= MAX_SENSORS and world.uavs <= MAX_UAVS and world.queue_capacity <= MAX_CAPACITY
         self.planner = MissionPlanner(self.scenario, self.belief) if small and spec.planner == "on" else None
         self.guidance = OperatorGuidance(spec.note, self.scenario)
         self.visit_orders = VisitOrders()

@@ -14,7 +14,7 @@ from shared.world.scenario import Scenario
 log = logging.getLogger(__name__)
 
 # Of more, plans take too long. There the LLM-free policy, look-ahead, stands in for the plan.
-MAX_SENSORS, MAX_UAVS = 1000, 40
+MAX_SENSORS, MAX_UAVS, MAX_CAPACITY = 1000, 40, 2000
 
 
 class MissionPlanner(RecedingHorizon):

@@ -6,6 +6,7 @@ from service.config.settings import Settings, prompt_tokens
 from service.errors import Refused
 from service.llm.request_bodies import WarmUp
 from service.mission.resolved_spec import ResolvedSpec
+from service.prompting.candidates import MOST_LABELS
 from service.prompting.compact_prompt import CompactTemplate
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.paper_prompt import Template
@@ -52,6 +53,11 @@ class PromptFit:
                 "prompt.format",
                 "compact needs an LLM with an adapter: leave AICVDS_LLM_ADAPTER unset for the embedded LLM's, "
                 "or set it to `served` where your LLM server applies it",
+            )
+        if self._rows > MOST_LABELS and not self.spec.uses_attention and (self._compact or self.spec.mode == "guided"):
+            raise Refused(
+                "attention",
+                f"a prompt with letters has at most {MOST_LABELS} sensors, not all {self._rows}: leave it on",
             )
         if self.fits():
             return

@@ -21,7 +21,7 @@ from shared.features.augmented_state import Reach, State
 from shared.world.step_rule import Action
 
 # OpenAI and vLLM return the probabilities of at most 20 tokens.
-_MOST_LABELS = 20
+MOST_LABELS = 20
 _MOST_VELOCITIES = 4
 # Velocities that move at least this share of the most packets are equally good for the sensor.
 _NEARLY_BEST = 0.9
@@ -37,8 +37,8 @@ class Letters:
     @classmethod
     def of(cls, rows: int) -> Self:
         """Letters for the rows: 1 to 4 for each, and fewer rows where 20 letters are too few."""
-        velocities = max(1, min(_MOST_VELOCITIES, _MOST_LABELS // rows))
-        return cls(min(rows, _MOST_LABELS // velocities), velocities)
+        velocities = max(1, min(_MOST_VELOCITIES, MOST_LABELS // rows))
+        return cls(min(rows, MOST_LABELS // velocities), velocities)
 
     @cached_property
     def all(self) -> str:
@@ -61,12 +61,14 @@ class Viewpoint:
 
     Attributes:
         learned: whether links follow the fleet's learned channel; otherwise they follow the formula.
+        nearest: the velocity nearest to one that the operator allows to the sensor in a row of the state.
     """
 
     belief: FleetBelief
     uav_id: int
     step: int
     learned: bool = True
+    nearest: Callable[[int, int], int] = lambda row, velocity: velocity
 
 
 class RowsWriter(Protocol):
@@ -97,22 +99,18 @@ class CandidateSet:
     rows: str
 
     @classmethod
-    def of(cls, state: State, reach: Reach, shown: Sequence[int], letters: Letters, write: RowsWriter) -> Self:
+    def of(
+        cls, state: State, reach: Reach, shown: Sequence[int], letters: Letters, view: Viewpoint, write: RowsWriter
+    ) -> Self:
         """The candidates for these rows of a state, in this order, up to the number of letters."""
         actions: dict[Action, int] = {}
         labels: dict[str, int] = {}
         rows = shown[: letters.rows]
-        options = [velocity_options(reach, row, letters.velocities) for row in rows]
+        options = [[view.nearest(row, v) for v in velocity_options(reach, row, letters.velocities)] for row in rows]
         for number, row in enumerate(rows):
             for letter, velocity in zip(letters.of_row(number), options[number], strict=True):
                 labels[letter] = actions.setdefault(Action(int(state.ids[row]), velocity), len(actions))
         return cls(list(actions), labels, write(rows, letters.first[: len(rows)], options))
-
-    def with_velocities(self, velocity: Callable[[int, int], int]) -> CandidateSet:
-        """The set with each action's velocity replaced by ``velocity(sensor, velocity)``; equal actions merge."""
-        actions: dict[Action, int] = {}
-        index = [actions.setdefault(Action(s, velocity(s, v)), len(actions)) for s, v in self.actions]
-        return CandidateSet(list(actions), {label: index[i] for label, i in self.labels.items()}, self.rows)
 
     def with_actions(self, added: Sequence[Action]) -> CandidateSet:
         """The set with more actions, which have no letter."""

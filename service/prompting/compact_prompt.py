@@ -184,7 +184,7 @@ class CompactTemplate(GuidedTemplate):
                 for letter, own, row in zip(letters, signs, shown_digits, strict=True)
             )
 
-        return CandidateSet.of(state, offered, shown, self.letters, write)
+        return CandidateSet.of(state, offered, shown, self.letters, view, write)
 
     def content_free(self, uavs: Sequence[int] = ()) -> list[str]:
         """None: the adapter is trained with shuffled rows, so it has no bias towards letters to be measured."""

@@ -89,7 +89,7 @@ class GuidedTemplate(Template):
                 text += f"{letter}{cell['queue']},{cell['age']},{span}\n"
             return text
 
-        return CandidateSet.of(state, offered, shown, self.letters, write)
+        return CandidateSet.of(state, offered, shown, self.letters, view, write)
 
     def choice_prompt(self, candidates: CandidateSet, state: State, experiences: Sequence[str]) -> Prompt:
         """The prompt for one decision; the parameters are those of :meth:`Template.prompt`."""

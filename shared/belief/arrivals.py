@@ -42,7 +42,7 @@ class Arrivals:
         count, mean = scenario.sensors, scenario.mean_arrival_rate
         spread = (scenario.arrival_rate_max - scenario.arrival_rate_min) ** 2 / 12
         # A range without width makes the rate certain: its prior counts as very many steps. So does a rate of zero.
-        prior_steps = mean / max(spread, 1e-3) if mean > _ZERO_RATE else _CERTAIN_STEPS
+        prior_steps = mean / max(spread, mean / _CERTAIN_STEPS) if mean > _ZERO_RATE else _CERTAIN_STEPS
         self.arrived: FloatArray = np.full(count, mean * prior_steps)
         self.watched: FloatArray = np.full(count, prior_steps)
         self.rate: FloatArray = self.arrived / self.watched

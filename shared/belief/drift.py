@@ -14,7 +14,7 @@ _NOTHING = 1e-6
 _PRIOR_STEPS = 1.0
 _KEPT = 0.97
 # Metres of still air of one step of the integration.
-_STRIDE_M = 50.0
+_STRIDE_M, _MOST_STRIDES = 50.0, 512
 _SLOWEST, _FASTEST = 0.1, 2.0
 _BRAKING_M = 40.0
 
@@ -70,11 +70,12 @@ class Drift:
         if self.none or not len(still_m):
             return still_m
         wind, at = self.wind, [0.0]
-        strides = int(np.ceil(float(still_m.max()) / _STRIDE_M)) + 1
+        stride = max(_STRIDE_M, float(still_m.max()) / _MOST_STRIDES)
+        strides = int(np.ceil(float(still_m.max()) / stride)) + 1
         for _ in range(strides):
-            heading = _headings(path, np.array([start_m + at[-1] + _STRIDE_M / 2]))[0]
-            at.append(at[-1] + _STRIDE_M * min(max(1.0 + float(heading @ wind), _SLOWEST), _FASTEST))
-        return np.asarray(np.interp(still_m, np.arange(strides + 1) * _STRIDE_M, at))
+            heading = _headings(path, np.array([start_m + at[-1] + stride / 2]))[0]
+            at.append(at[-1] + stride * min(max(1.0 + float(heading @ wind), _SLOWEST), _FASTEST))
+        return np.asarray(np.interp(still_m, np.arange(strides + 1) * stride, at))
 
     def state_dict(self) -> dict[str, Any]:
         """The estimate, as copies."""

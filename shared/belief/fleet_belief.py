@@ -14,6 +14,7 @@ from shared.belief.drift import Drift
 from shared.belief.learned_channel import ExpectedLinks, LearnedChannel
 from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Point, Scenario
+from shared.world.step_rule import least_joules_a_packet
 from shared.world.trajectory import Trajectory, progress_of, trajectories
 
 # A distance out of reach of every UAV.
@@ -106,7 +107,7 @@ class FleetBelief:
         base: shape ``(J,)``, packets at the start of step ``since``, less the packets collected in that step.
         since: shape ``(J,)``, steps; negative for a queue that was read before the mission's first step.
         heard: shape ``(J,)``, the step of the newest beacon, -1 for none.
-        battery: shape ``(J,)``, joules.
+        battery: shape ``(J,)``, joules; 0 for a sensor whose battery pays for no packet.
         visited: shape ``(J,)``, the step of the last visit, assuming that UAVs fly their decisions; -1 for none.
         uavs: by index, the UAVs that were ever located.
         arrivals, channel, drift: learned from queues, from gains and outcomes, and from the UAVs' progress.
@@ -116,7 +117,7 @@ class FleetBelief:
         count, capacity = scenario.sensors, scenario.queue_capacity
         fewest, most = scenario.initial_queue_min, scenario.initial_queue_max
         self._scenario = scenario
-        self._paths = trajectories(scenario)
+        self._paths, self._packet_j = trajectories(scenario), least_joules_a_packet(scenario)
         self._drawn_variance = ((most - fewest) * capacity) ** 2 / 12
         self.base: FloatArray = np.full(count, (most + fewest) / 2 * capacity)
         self.since: IntArray = np.zeros(count, dtype=np.int64)
@@ -157,7 +158,7 @@ class FleetBelief:
             )
         # Copies, because numba would recompile the function for other types and for read-only arrays.
         heard = np.array(ids, dtype=np.int64), np.array(beacon, dtype=np.int64)
-        values = np.array(queue, dtype=np.float64), np.array(battery, dtype=np.float64)
+        values = np.array(queue, dtype=np.float64), np.where(battery < self._packet_j, 0.0, battery)
         (which, steps, at), came = np.empty((3, len(ids)), dtype=np.int64), np.empty(len(ids))
         known = self.base, self.since, self.heard, self.battery, self.visited, self.arrivals.rate
         count = take_beacons(*known, float(self._scenario.queue_capacity), *heard, *values, which, came, steps, at)
@@ -166,7 +167,8 @@ class FleetBelief:
 
     def begin(self, ids: IntArray, step: IntArray, queue: FloatArray, battery: FloatArray) -> None:
         """Set the queues ``(n,)`` of sensors ``(n,)`` in steps ``(n,)`` before the mission's first one."""
-        self.base[ids], self.since[ids], self.battery[ids] = queue, step, battery
+        self.base[ids], self.since[ids] = queue, step
+        self.battery[ids] = np.where(battery < self._packet_j, 0.0, battery)
 
     def locate(self, uav: int, step: int, position: Sequence[float], reported_m: float | None = None) -> None:
         """Set a UAV's position at the start of a step; ``reported_m`` is its own report of its progress, metres."""
@@ -241,11 +243,12 @@ class FleetBelief:
         if visit is None or visit.step != step or visit.failed is not None:
             return
         visit.failed = failed
-        untouched = self.heard[visit.sensor] <= step
-        if failed and visit.collected and untouched and self.since[visit.sensor] == step:
-            self.base[visit.sensor], self.since[visit.sensor] = visit.base, visit.since
-            self.visited[visit.sensor] = visit.visited
-        elif not failed and not visit.collected and untouched:
+        if failed and visit.collected:
+            if self.visited[visit.sensor] == step:
+                self.visited[visit.sensor] = visit.visited
+            if self.heard[visit.sensor] <= step and self.since[visit.sensor] == step:
+                self.base[visit.sensor], self.since[visit.sensor] = visit.base, visit.since
+        elif not failed and not visit.collected:
             place = self.places[visit.sensor]
             self.collect(visit.sensor, self.channel.packets(last.position, place, visit.sensor, held=True), step)
 

@@ -14,6 +14,7 @@ from shared.wire.schemas import Features, UavState
 from shared.wire.sensor_arrays import SensorArrays, arrays_of
 from shared.world.channel import FloatArray, best_gain_db, channel_gain_db
 from shared.world.scenario import Point, Scenario
+from shared.world.step_rule import least_joules_a_packet
 from shared.world.trajectory import progress_of, trajectories
 from shared.world.urgency import overflow_probability, urgency_of, with_bonus
 
@@ -189,7 +190,7 @@ def augment(
     distance = np.sqrt(east * east + north * north)
     if belief is None:
         assert rates is not None
-        rate = rates[ids]
+        rate, battery = rates[ids], np.where(battery < least_joules_a_packet(scenario), 0.0, battery)
     else:
         heard = np.ones_like(heard)
         battery, queue = belief.battery[ids], belief.queue(step, ids)

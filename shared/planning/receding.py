@@ -206,9 +206,9 @@ class RecedingHorizon:
         def renamed(actions: IntArray) -> IntArray:
             return np.array([(index.get(sensor, nowhere), v) for sensor, v in actions.tolist()], dtype=np.int64)
 
-        # Sensors reserved in this step are barred, except those of the belief's decisions, which are fixed.
-        usable = np.ones((horizon, nowhere + 1), dtype=np.bool_)
-        usable[0, :-1] = ~np.isin(kept, list(set(taken) - {sensor for sensor, _ in decided.values()}))
+        # Sensors with flat batteries are barred, and those reserved in this step, except the belief's decisions.
+        usable = np.tile(np.append(belief.battery[kept] > 0, True), (horizon, 1))
+        usable[0, :-1] &= ~np.isin(kept, list(set(taken) - {sensor for sensor, _ in decided.values()}))
         links = self._links(present, kept, horizon)
         ahead = self._chances_ahead(present, kept, horizon)
         problem = FleetProblem(
@@ -247,7 +247,7 @@ class RecedingHorizon:
         ``None`` without a plan of this step, or if the sensor is reserved.
         """
         last, actions = self._belief.uavs.get(uav), self.plans.get(uav)
-        if last is None or last.step != self.step or actions is None or not len(actions):
+        if last is None or not self.step - 1 <= last.step <= self.step or actions is None or not len(actions):
             return None
         sensor, velocity = actions[0].tolist()
         if sensor < 0:
@@ -262,7 +262,7 @@ class RecedingHorizon:
             return present, present
         at = np.array([self._belief.trajectory(uav).at(self._belief.uavs[uav].progress_m or 0.0) for uav in present])
         away = np.hypot(*(at[:, None] - at[[present.index(uav) for uav in own]]).T).min(axis=0)
-        nearest = [present[place] for place in away.argsort(kind="stable")]
+        nearest = sorted(present, key=lambda uav: (uav not in own, away[present.index(uav)]))
         free = nearest[: max(JOINT_UAVS, len(own))]
         return sorted(free), sorted(nearest[: len(free) + _NEIGHBOURS])
 
@@ -280,7 +280,8 @@ class RecedingHorizon:
         room = (world.queue_capacity - belief.queue(self.step)) / np.maximum(belief.arrivals.rate, 1e-9)
         if self.guidance.wishes:
             # The operator's sensors come before those that fill first.
-            room = np.where(np.isfinite(self.guidance.visit_intervals(world.sensors)), -1.0, room)
+            ordered = np.isfinite(self.guidance.visit_intervals(world.sensors))
+            room, near = np.where(ordered, -1.0, room), near | (ordered & ahead)
         order = np.lexsort((room, ~near, ~ahead))
         if world.uavs > JOINT_UAVS:
             mine = self._within_radio(own, np.arange(ends + 1))[order]
@@ -365,7 +366,8 @@ class RecedingHorizon:
             ),
             capacity=world.queue_capacity,
             best_chance=np.append(best, 1.0),
-            weights=np.append(self.guidance.weights(world.sensors)[kept], 1.0),
+            # What a sensor with a flat battery loses is lost whatever the fleet does.
+            weights=np.append(self.guidance.weights(world.sensors)[kept] * (belief.battery[kept] > 0), 1.0),
         )
 
     def _beyond(self, horizon: int) -> tuple[int, ...]:

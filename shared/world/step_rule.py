@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.world.channel import FloatArray, IntArray
+from shared.world.channel import FloatArray, IntArray, rate_bps
 from shared.world.scenario import Scenario
 
 BoolArray = NDArray[np.bool_]
@@ -86,6 +86,11 @@ def arrive(queue: Any, arrived: Any, capacity: int) -> tuple[Any, Any]:
     filled = queue + arrived
     left = np.minimum(filled, capacity)
     return left, filled - left
+
+
+def least_joules_a_packet(scenario: Scenario) -> float:
+    """The energy of one packet over the shortest link; a sensor with less can transmit nothing."""
+    return float(joules_a_packet(rate_bps(0.0, scenario), scenario))
 
 
 def joules_a_packet(rate_bps: FloatArray, scenario: Scenario) -> FloatArray:

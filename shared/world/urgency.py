@@ -32,16 +32,17 @@ def above_poisson(room: FloatArray, mean: FloatArray, above: FloatArray) -> None
         above: shape ``(n,)``, is written.
     """
     for i in range(len(room)):
-        total = 0.0
+        # More packets are as good as impossible.
+        most, total = int(min(room[i], mean[i] + 12.0 * math.sqrt(mean[i]) + 40.0)), 0.0
         if mean[i] < _SMALL_MEAN:
             probability = math.exp(-mean[i])
             total = probability
-            for packets in range(1, int(room[i]) + 1):
+            for packets in range(1, most + 1):
                 probability *= mean[i] / packets
                 total += probability
         else:
             logarithm = -mean[i]
-            for packets in range(1, int(room[i]) + 1):
+            for packets in range(1, most + 1):
                 logarithm += math.log(mean[i] / packets)
                 total += math.exp(logarithm)
         above[i] = min(max(1.0 - total, 0.0), 1.0)

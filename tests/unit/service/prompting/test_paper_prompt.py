@@ -170,7 +170,12 @@ def test_thirty_experiences_fit_the_embedded_models_context() -> None:
     "spec",
     [
         MissionSpec(mode="llm", scenario="dense", prompt=PromptStyle(format="csv", experiences=100), top_k=20),
-        MissionSpec(mode="llm", attention="off", scenario=SCENARIOS["dense"].model_copy(update={"sensors": 500})),
+        MissionSpec(
+            mode="llm",
+            attention="off",
+            scenario=SCENARIOS["dense"].model_copy(update={"sensors": 500}),
+            prompt=PromptStyle(format="csv"),
+        ),
     ],
 )
 def test_a_prompt_that_cannot_fit_the_context_is_refused(spec: MissionSpec) -> None:

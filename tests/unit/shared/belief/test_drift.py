@@ -90,3 +90,10 @@ def test_a_uav_that_hovers_is_blown_nowhere_by_the_noise_of_its_place(start_m: f
     stays.learn(LAP, start_m, 50.0, (start_m + shaken_m) % LAP.length_m)
     ways = np.array([0.0, 140.0])
     assert stays.flown(LAP, start_m, ways)[1] < 140.0
+
+
+def test_a_way_of_a_whole_flight_is_as_the_sum_of_its_parts() -> None:
+    drift, end, whole = learned((0.2, 0.1)), 100.0, 60_000.0
+    for _ in range(60):
+        end += float(drift.flown(LAP, end, np.array([whole / 60]))[0])
+    assert float(drift.flown(LAP, 100.0, np.array([whole]))[0]) == pytest.approx(end - 100.0, rel=0.01)
