@@ -5,9 +5,12 @@ from __future__ import annotations
 import asyncio
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
+
+import pytest
 
 from field.vehicles.field_pilot import FieldPilot
+from field.vehicles.field_run import FieldJob, join_mission
 from field.vehicles.radio import Beacon, Collected, Spot
 from shared.client.calls import Exchange
 from shared.client.edge_client import AsyncEdgeClient
@@ -86,3 +89,15 @@ async def test_an_outcome_that_is_refused_at_landing_keeps_no_other_back() -> No
             pilot.learn(uav, PilotChoice(0, 7, "policy", "mode_policy", Exchange(answer, 1.0, 1, 1, 1)), 0.0, False)
         await pilot.land()
     assert len(sent) == 3 and pilot.last_error is not None and "unknown decision" in pilot.last_error
+
+
+async def test_a_mission_that_was_flown_before_is_named(edge: Edge, capsys: pytest.CaptureFixture[str]) -> None:
+    trial, url = Trial(steps=1), str(edge(mode="policy").base_url)
+    job = cast(FieldJob, SimpleNamespace(mission_id="field", edge=url))
+    for expected in (None, "it has 3 decisions already: if they are of an earlier flight, DELETE it first"):
+        async with AsyncEdgeClient(url, timeout_s=PATIENCE_S) as client:
+            await join_mission(FieldPilot(client, "field", trial.site.scenario, PATIENCE_S), job)
+        printed = "".join(capsys.readouterr())
+        assert "mission field, mode policy; watch it at" in printed
+        assert ("decisions already" in printed) == (expected is not None) and (expected or "") in printed
+        await trial.fly(url)
