@@ -126,7 +126,6 @@ async def join_mission(pilot: FieldPilot, job: FieldJob) -> None:
         pilot.spec = with_edge_defaults(pilot.spec, status)
         print_line(f"mission {job.mission_id}, mode {status.mode}; watch it at {job.edge}/?mission={job.mission_id}")
         if status.decisions:
-            # The first reports are older than what that flight has left behind, and the fleet would decide by it.
             print_line(
                 f"it has {status.decisions} decisions already: if they are of an earlier flight, DELETE it first"
             )

@@ -207,10 +207,8 @@ class AttendedState:
                 approach=self.state.approaches([row], self.mission.scenario)[0],
                 velocity=velocity,
             )
-        if row is None or not self.state.heard[row]:
-            seen = self.mission.template.unreported_row(sensor_id)
-        else:
-            seen = cells(self.state, [row])[0]
+        heard = self.state.heard[rows].any()
+        seen = cells(self.state, rows.tolist())[0] if heard else self.mission.template.unreported_row(sensor_id)
         return Pending(
             decision_id=decision_id,
             uav_id=self.uav_id,

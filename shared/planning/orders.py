@@ -240,6 +240,17 @@ class Guidance(Received):
                 late[since, now] = sum(LATE_PACKETS * (self.overdue(step + n, last) > 0) for n in steps)
         return late
 
+    def lateness_beyond(
+        self, step: int, visits: NDArray[np.int64], ways: NDArray[np.int64], counted: int
+    ) -> FloatArray:
+        """The price of visits that are made so many steps, ``ways`` ``(K,)``, from ``step`` on, ``(K, J)``, packets.
+
+        It is above that of the ``counted`` steps which :meth:`lateness` counts after the plan.
+        """
+        due = visits + self.visit_intervals(len(visits)) - step
+        late = [steps - np.clip(due, 0, steps) for steps in (*ways.tolist(), counted)]
+        return np.asarray(LATE_PACKETS * (np.array(late[:-1]) - late[-1]))
+
     def merged_with(self, in_force: Guidance, levels: int) -> Guidance:
         """These orders merged with the orders in force.
 

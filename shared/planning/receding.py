@@ -56,14 +56,12 @@ _NOWHERE = 10**9
 def steps_to(good: NDArray[np.bool_], stride: int, sums: int, fastest: int) -> IntArray:
     """The steps at full speed to the next good place for each sensor, ``(sums, J)``, from velocities' sums 0, 1, ...
 
+    They are more than any way has if no good place follows.
+
     Args:
         good: shape ``(P, J)``, whether a place is good, at the sums 0, ``stride``, ``2 stride``, ...
         stride: between two places, as a sum of velocities.
-        sums: C.
         fastest: the velocity.
-
-    Returns:
-        the steps; more than any way has if no good place follows.
     """
     count = len(good)
     place = np.where(good, np.arange(count)[:, None], _NOWHERE)
@@ -218,7 +216,7 @@ class RecedingHorizon:
             places=np.concatenate((np.nan_to_num(belief.places[kept], nan=FAR_M), [[FAR_M, FAR_M]])),
             fixed={present.index(u): renamed(actions) for u, actions in fixed.items()},
             usable=usable,
-            chains=self._chains(kept, horizon, ahead),
+            chains=self._chains(kept, horizon, ahead, free),
             stages=self._stages(ahead, horizon),
             **links,
             **self._outlook(kept, horizon),
@@ -325,13 +323,13 @@ class RecedingHorizon:
 
     def _stages(self, chances: list[FloatArray], horizon: int) -> list[IntArray]:
         """The stages after the horizon by the UAVs' ways to the kept sensors, over links of these chances."""
-        fastest = self._scenario.max_velocity
+        fastest, ways = self._scenario.max_velocity, self._ways
         sums = horizon * fastest + 1
         best = np.max(chances, axis=(0, 1))
         stages = []
         for chance in chances:
             steps = steps_to(chance >= _GOOD_SHARE * best, _STRIDE, sums, fastest)
-            stages.append(np.pad(np.minimum(np.searchsorted(_BEYOND, steps), len(_BEYOND) - 1), ((0, 0), (0, 1))))
+            stages.append(np.pad(np.minimum(np.searchsorted(ways, steps), len(ways) - 1), ((0, 0), (0, 1))))
         return stages
 
     def _chances_ahead(self, present: list[int], kept: IntArray, horizon: int) -> list[FloatArray]:
@@ -341,7 +339,7 @@ class RecedingHorizon:
         links = [self._belief.links(uav, metres) for uav in present]
         return [(link.hold * (link.packets > 0))[:, kept] for link in links]
 
-    def _chains(self, kept: IntArray, horizon: int, ahead: list[FloatArray]) -> QueueChains:
+    def _chains(self, kept: IntArray, horizon: int, ahead: list[FloatArray], free: list[int]) -> QueueChains:
         """The queues' chains of the kept sensors, and of one nowhere without packets."""
         world, belief, step = self._scenario, self._belief, self.step
         arrivals = belief.arrivals
@@ -355,7 +353,7 @@ class RecedingHorizon:
         best = np.max(ahead, axis=(0, 1))
         # The error of the rate is the same in all steps: of n steps it adds n times a step's variance to each.
         spread = coming * dispersion + rate_variance * horizon / 2
-        return queue_chains(
+        chains = queue_chains(
             base=np.append(base, 0.0),
             base_variance=np.append(belief.base_variance[kept], 0.0),
             came=Arriving(np.append(came, 0.0), np.append(came * dispersion + age**2 * rate_variance, 0.0)),
@@ -369,11 +367,21 @@ class RecedingHorizon:
             # What a sensor with a flat battery loses is lost whatever the fleet does.
             weights=np.append(self.guidance.weights(world.sensors)[kept] * (belief.battery[kept] > 0), 1.0),
         )
+        if self.guidance.wishes:
+            away = ~self._within_radio(free, np.arange(horizon * world.max_velocity + 1)) & (belief.battery > 0)
+            late = self.guidance.lateness_beyond(step + horizon, belief.visited, self._ways, int(beyond[0, 0])) * away
+            chains.after[:, :-1] += late[:, kept, None]
+        return chains
+
+    @property
+    def _ways(self) -> IntArray:
+        """By stage, the steps at full speed from the plan's end to a sensor; single ones where orders may be late."""
+        return np.arange(1, _BEYOND[-1] + 1) if self.guidance.wishes else np.array(_BEYOND)
 
     def _beyond(self, horizon: int) -> tuple[int, ...]:
         """By stage, the number of steps after the plan that count."""
-        left = self._scenario.steps - self.step
-        return tuple(max(0, min(steps, left - horizon)) if left > 0 else steps for steps in _BEYOND)
+        left, counted = self._scenario.steps - self.step, np.array(_BEYOND)[np.searchsorted(_BEYOND, self._ways)]
+        return tuple(max(0, min(steps, left - horizon)) if left > 0 else steps for steps in counted.tolist())
 
     def _guided(self, kept: IntArray, horizon: int, free: list[int]) -> dict[str, Any]:
         """The part of the problem that the guidance and these UAVs' top speeds make, with one sensor nowhere."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from shared.belief.fleet_belief import FleetBelief
 from shared.planning.annealing import Annealing
+from shared.planning.orders import Guidance, SensorWish
 from shared.planning.receding import RecedingHorizon, steps_to
 from shared.world.scenario import Scenario
 from shared.world.trajectory import Trajectory, trajectories
@@ -53,3 +54,46 @@ def test_sensors_beyond_the_horizon_take_no_ones_place_in_a_plan() -> None:
     draft = planner.draft([0])
     assert draft is not None
     assert draft.kept[:35].tolist() == list(range(35)) and len(draft.kept) == 40
+
+
+def test_a_sensor_far_beyond_the_plans_horizon_is_flown_to_for_its_order() -> None:
+    """It is 1.7 km ahead of two sensors that lose at most twelve packets a step meanwhile; a late visit costs 20."""
+    world = Scenario(
+        name="line",
+        sensors=3,
+        uavs=1,
+        steps=1000,
+        routes=(((0.0, 0.0), (6000.0, 0.0)),),
+        area_m=6000.0,
+        arrival_rate_min=6,
+        arrival_rate_max=6,
+    )
+    places = np.array([[500.0, 0.0], [250.0, 0.0], [2300.0, 0.0]])
+
+    def progress_after(steps: int, visit_every: int) -> float:
+        belief = FleetBelief(world)
+        planner = RecedingHorizon(world, belief)
+        planner.guidance = Guidance(sensors=[SensorWish(sensor_id=2, visit_every=visit_every)])
+        progress, queue = 300.0, np.full(3, 50.0)
+        for step in range(steps):
+            belief.advance(step)
+            planner.begin(step)
+            belief.locate(0, step, (progress, 0.0), progress)
+            near = np.flatnonzero(np.abs(places[:, 0] - progress) <= 360.0)
+            belief.hear(near, places[near], np.full(len(near), step), queue[near], np.full(len(near), 50.0))
+            belief.places[:] = places
+            draft = planner.draft([0])
+            assert draft is not None
+            planner.adopt(draft, draft.search())
+            action = planner.action(0)
+            assert action is not None
+            belief.record_decision(0, step, *action)
+            progress += 10.0 * action.velocity
+            served = bool(abs(places[action.sensor_id, 0] - progress) <= 360.0)
+            queue[action.sensor_id] *= not served
+            belief.settle(0, step, not served)
+            queue = np.minimum(queue + 6.0, 60.0)
+        return progress
+
+    assert progress_after(20, visit_every=10) > 2300.0 - 360.0
+    assert progress_after(20, visit_every=900) < 1000.0
