@@ -35,7 +35,7 @@ def main() -> int:
     args = parser.parse_args()
     began = time.monotonic()
     try:
-        if not PYTHON.exists():
+        if not (VENV / "bin" / "pip").exists():
             venv.create(VENV, with_pip=True)
         installer = _pip() if args.pip else _uv() or _pip()
         print(f"Installing {args.what} into {VENV.name} by {installer.name}", flush=True)
@@ -102,7 +102,6 @@ def _uv() -> Installer | None:
     # As pip does: the best version of all indexes, not the first index that has the package.
     command = [str(uv), "pip", "install", "--quiet", "--python", str(PYTHON), "--index-strategy", "unsafe-best-match"]
     options = {
-        "index-url": "--default-index",
         "extra-index-url": "--index",
         "find-links": "--find-links",
         "constraint": "--constraint",
@@ -114,6 +113,11 @@ def _uv() -> Installer | None:
     if settings.get("no-index", ["false"])[-1].lower() in ("1", "true", "yes", "on"):
         command.append("--no-index")
     environment = {}
+    if indexes := settings.get("index-url"):
+        # No option, of which a second one would be an error.
+        environment["UV_DEFAULT_INDEX"] = indexes[-1]
+    if proxies := settings.get("proxy"):
+        environment["HTTP_PROXY"] = environment["HTTPS_PROXY"] = proxies[-1]
     if certificates := settings.get("cert"):
         environment["SSL_CERT_FILE"] = certificates[-1]
     if timeout := settings.get("timeout") or settings.get("default-timeout"):

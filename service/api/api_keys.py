@@ -124,6 +124,7 @@ class KeyFile(BaseModel):
 def editing(path: Path) -> Iterator[KeyFile]:
     """The file's keys for changes, locked, and written back at the end. Raises ``BadKeys``."""
     try:
+        path = path.resolve()  # A link stays one: an edge may read its target.
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = path.with_name(f".{path.name}.lock").open("w")
     except OSError as error:

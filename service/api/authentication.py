@@ -128,7 +128,7 @@ class KnownHosts:
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self.app = app
-        names = {_PORT.sub("", name.strip().lower()) for name in settings.hosts.split(",")}
+        names = {_PORT.sub("", name.strip().lower()).strip("[]") for name in settings.hosts.split(",")}
         self._checks = settings.keys is None and "*" not in names
         self._any_address = settings.anonymous == "on"
         own = {"localhost", urlsplit(settings.advertise_url or "").hostname or "localhost"}

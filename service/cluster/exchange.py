@@ -101,7 +101,8 @@ def gathered(texts: Mapping[str, str]) -> str:
                 samples.setdefault(name, []).append(_labelled(line, process))
             elif line not in heads.setdefault(name, []) and len(heads[name]) < 2:
                 heads[name].append(line)
-    return "".join(f"{line}\n" for name in heads for line in (*heads[name], *samples.get(name, ())))
+    ends = "# EOF\n" if any(text.endswith("# EOF\n") for text in texts.values()) else ""
+    return "".join(f"{line}\n" for name in heads for line in (*heads[name], *samples.get(name, ()))) + ends
 
 
 def _labelled(sample: str, process: str) -> str:
@@ -172,7 +173,7 @@ async def answer_of(app: ASGIApp, request: Exchanged) -> Answer:
 def _fields(body: bytes) -> dict[str, Any]:
     try:
         found = json.loads(body)
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -98,9 +98,9 @@ class Ingress:
                 answer = await self._forward(request, moved)
                 if answer.status != 421:
                     return answer
-                del self._moved[mission_id]
+                self._moved.take(mission_id)
             except httpx.TransportError as error:
-                del self._moved[mission_id]
+                self._moved.take(mission_id)
                 # The edge may have made the decision, so only the client can decide whether to repeat the request.
                 if not isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
                     raise

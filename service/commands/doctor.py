@@ -216,9 +216,10 @@ def embedded(settings: Settings) -> Iterator[Finding]:
     except ModelMissing as error:
         yield Finding("LLM", str(error).partition(":")[0], "aicvds model fetch")
         return
-    adapter = settings.embedded_adapter
-    if adapter is not None and not adapter.is_file():
-        yield Finding("LLM", f"adapter {adapter} is not there", "correct or unset AICVDS_LLM_ADAPTER")
+    adapter, orders = settings.embedded_adapter, settings.embedded_orders
+    for one, setting in ((adapter, "ADAPTER"), (orders, "ORDERS")):
+        if one is not None and not one.is_file():
+            yield Finding("LLM", f"adapter {one} is not there", f"correct or unset AICVDS_LLM_{setting}")
     with_adapter = "no adapter" if adapter is None else f"adapter {adapter}"
     size = f"{file.stat().st_size / 1e6:.0f} MB"
     yield Finding("LLM", f"embedded, {file} ({size}), {with_adapter}, {settings.embedded_threads} threads")
@@ -228,5 +229,5 @@ def planner(settings: Settings) -> Finding:
     """Whether the fleet's planner can work."""
     if settings.planner == "off":
         return Finding("planner", "off: one step of look-ahead")
-    free_mb = shutil.disk_usage(Path.home()).free / 1e6
+    free_mb = shutil.disk_usage(next(at for at in (Path.home(), *Path.home().parents) if at.exists())).free / 1e6
     return Finding("planner", f"numba {version('numba')}; {free_mb:,.0f} MB of disk free")

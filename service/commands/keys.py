@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 from pydantic import ValidationError
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from service.api.api_keys import BadKeys, KeyFile, Scope, editing
 from shared.kit.validation_messages import problem_of
@@ -76,7 +76,7 @@ def main(argv: list[str]) -> int:
                 print(f"Key {command.name}, shown this once; send it as `Authorization: Bearer KEY`:", file=sys.stderr)
                 print(shown)
             case List():
-                table = Table("name", "scopes", "a minute", "missions")
+                table = Table(*(Column(name, overflow="fold") for name in ("name", "scopes", "a minute", "missions")))
                 for key in KeyFile.read(command.file).keys:
                     missions = " ".join(key.missions or ("all",))
                     table.add_row(key.name, " ".join(sorted(key.scopes)), str(key.per_minute), missions)

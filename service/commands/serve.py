@@ -132,7 +132,7 @@ def checked_settings(given: dict[str, Any], host: str | None = None) -> Settings
 
 def fault_of_keys(settings: Settings, host: str) -> str | None:
     """Why an edge does not listen on this host with the keys of its settings; None if it does."""
-    from service.api.api_keys import BadKeys, KeyFile
+    from service.api.api_keys import ApiKeys, BadKeys
 
     if settings.keys is None and settings.anonymous == "off" and not _is_loopback(host):
         return (
@@ -141,7 +141,7 @@ def fault_of_keys(settings: Settings, host: str) -> str | None:
         )
     if settings.keys is not None:
         try:
-            KeyFile.read(settings.keys)
+            ApiKeys(settings.keys)
         except BadKeys as error:
             return f"AICVDS_KEYS: {error}"
     return None

@@ -123,6 +123,8 @@ class StoredMissions:
 
     async def _claim_existing(self, mission_id: str) -> bool:
         """Take the lease of a mission that is in memory or in the store; returns whether it is."""
+        if mission_id not in self._missions:
+            await self._journal.stored(1.0)  # Of a deletion that is not committed yet the row is still there.
         if mission_id not in self._missions and not await self._read(self._store.has, mission_id):
             self.listed.discard(mission_id)
             await self._unless_misdirected(self.ownership.check_free, mission_id)

@@ -160,12 +160,13 @@ class _Orders:
             raise BadOrders("an order names no sensor")
         if words == [ALL]:
             return list(range(self._scenario.sensors))
-        if len(words) == 1 and "-" in words[0]:
-            first, last = (self._sensor(letter) for letter in words[0].split("-", 1))
-            if not first < last < first + self._scenario.sensors:
+        sensors: list[int] = []
+        for word in words:
+            first, last = self._sensor(word.split("-")[0]), self._sensor(word.split("-")[-1])
+            if not first + ("-" in word) <= last < first + self._scenario.sensors:
                 raise BadOrders(f"sensors {first} to {last} are no range")
-            return list(range(first, last + 1))
-        return [self._sensor(letter) for letter in words]
+            sensors += range(first, last + 1)
+        return sensors
 
     def _sensor(self, letter: str) -> int:
         value = self._plain(letter, "sensor")

@@ -217,10 +217,11 @@ class PhrasedNote:
         note = LetteredNote.of(self._lowered, 0)
 
         def letters(match: re.Match[str], part: str) -> str:
-            begin, end = match.span(part)
-            found = [letter for letter, number in note.numbers.items() if begin <= number.begin < end]
-            spans = len(found) == 2 and re.search(r"\d ?- ?\d| to | through ", match[part])
-            return ("-" if spans else " ").join(found)
+            # Each of a list's pieces is one number or a range.
+            begin, pieces = match.start(part), re.finditer(r"(?:(?! ?[,&]| and | or ).)+", match[part])
+            at = {number.begin - begin: letter for letter, number in note.numbers.items()}
+            spans = ([at[b] for b in sorted(at) if piece.start() <= b < piece.end()] for piece in pieces)
+            return " ".join("-".join(span) for span in spans if span)
 
         answer = []
         for means, match in self._orders:
@@ -321,6 +322,7 @@ def _clock(match: re.Match[str]) -> End | None:
     hour = hour % 12 + 12 * half.startswith("p") if half[:1] in ("a", "p") else hour
     if hour > 24 or int(match["minute"] or 0) > 59:
         return None
-    now = datetime.now().astimezone()
+    # Without a zone, for tomorrow's may be another one.
+    now = datetime.now()
     time = now.replace(hour=hour % 24, minute=int(match["minute"] or 0), second=0, microsecond=0)
-    return End(time=time if time > now else time + timedelta(days=1))
+    return End(time=(time if time > now else time + timedelta(days=1)).astimezone())

@@ -24,7 +24,7 @@ import aiohttp
 from service.llm.answers import Completion, NoDecision, TokenPosition
 
 _MOST = 200
-_READ = 8 * 1024
+_READ = 2 * 1024
 _SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 480.0
 _KEYS = re.compile(r"(bearer\s+|\b(?:sk|key|hf|gsk|nvapi|xai|pk)[-_])[^\s\"'<>]+|(?<=://)[^\s/@]+@", re.IGNORECASE)
 _TAGS = re.compile(r"<(script|style).*?</\1>|<[^>]*>", re.IGNORECASE | re.DOTALL)
@@ -144,8 +144,9 @@ def completion_of(answer: Any, base_url: str, secrets: tuple[str, ...] = ()) -> 
         raise NoDecision("llm_error", f"{base_url}: a completion without text{f': {said!r}' if said else ''}")
     plain = _without_thoughts(text)
     positions = _positions(choice)
-    if plain != text and not (plain and text.startswith(plain)):
-        positions = _after_thoughts(positions)
+    if reasoning or not (plain == text or (plain and text.startswith(plain))):
+        # vLLM's logprobs have the thoughts' tokens too, where it gives the thoughts apart.
+        positions = _after_thoughts(positions) or (positions if plain == text else ())
     prompt, cached, completion = _counts(answer.get("usage"))
     unfinished = cut and not plain.strip() and (not text or bool(reasoning) or plain != text)
     return Completion(plain, prompt, cached, completion, positions, unfinished=unfinished)
@@ -171,7 +172,7 @@ def _arguments(calls: Any) -> str | None:
 
 def streamed(content: bytes | bytearray) -> Any:
     """The completion whose parts, or whose whole, a server sent as events; raises ``ValueError``."""
-    lines = content.decode(errors="replace").splitlines()
+    lines = content.decode(errors="replace").split("\n")
     data = [line.removeprefix("data:") for line in lines if line.startswith(("data:", "{"))]
     parts = [json.loads(line) for line in data if line.strip() != "[DONE]"]
     try:
@@ -252,7 +253,7 @@ def _positions(choice: Any) -> tuple[TokenPosition, ...]:
 
 def _after_thoughts(positions: tuple[TokenPosition, ...]) -> tuple[TokenPosition, ...]:
     """The positions after the thoughts' closing tag and its blanks; none if no token has the tag."""
-    closed = [index for index, position in enumerate(positions) if "</think" in position.token]
+    closed = [index for index, position in enumerate(positions) if _CLOSING.search(position.token)]
     if not closed:
         return ()
     rest = positions[closed[-1] + 1 :]

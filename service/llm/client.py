@@ -197,7 +197,7 @@ class LLMClient:
         if not 200 <= status < 300:
             kind = NotUnderstood if status in _NOT_UNDERSTOOD else NoDecision
             target = head.get("Location", "").split("?")[0] if status in _REDIRECTS else ""
-            said = excerpt(target.encode() or content, self._secrets)
+            said = excerpt(target.encode(errors="replace") or content, self._secrets)
             detail = f" to {said}" if target else f": {said}" if said else ""
             text = f"{self.base_url}: HTTP {status}{detail}"
             pause_s = pause_of(head)
@@ -254,7 +254,7 @@ def _proxy_to(url: str) -> dict[str, Any]:
     target = httpx.URL(url)
     proxies = getproxies()
     named = proxies.get(target.scheme) or proxies.get("all")
-    if not named or proxy_bypass(target.host):
+    if not named or proxy_bypass(target.host) or proxy_bypass(target.netloc.decode()):
         return {}
     try:
         proxy = httpx.URL(named if "://" in named else f"http://{named}")

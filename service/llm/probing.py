@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from service.config.settings import Settings
-from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable, check_answer
+from service.llm.answers import Busy, Completion, NoDecision, NotUnderstood, Unreachable, check_answer
 from service.llm.calibration import check_labels, probabilities
 from service.llm.request_bodies import (
     WARM_UP_CHOICES,
@@ -143,6 +143,10 @@ async def _answer(client: LLMClient, body: dict[str, Any]) -> Completion | None:
         return await client.complete(body)
     except Unreachable:
         raise
+    except Busy as busy:
+        # It says nothing of what the server can do.
+        await asyncio.sleep(busy.pause_s)
+        return await _answer(client, body)
     except NoDecision:
         return None
 

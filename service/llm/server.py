@@ -277,7 +277,7 @@ class LlmServer:
             await asyncio.sleep(self._breaker.pause_s)
             try:
                 await self.connection.ping()
-            except (NoDecision, TimeoutError) as error:
+            except Exception as error:
                 self._breaker.failed()
                 log.warning("LLM still fails, next try in %g s: %s", self._breaker.pause_s, error)
             else:

@@ -85,10 +85,10 @@ class Metrics:
         Info("aicvds_build", "The version of this edge", registry=r).info({"version": version("aic-vds")})
         self.decisions = counter("aicvds_decisions", "Decisions answered", ["source", "reason"])
         self.decision_seconds = histogram(
-            "aicvds_decision_seconds", "Time of a decision by stage", ["stage"], buckets=_DECISION_BUCKETS
+            "aicvds_decision_seconds", "Times by stage", ["stage"], buckets=_DECISION_BUCKETS
         )
         self.overhead_seconds = histogram(
-            "aicvds_overhead_seconds", "The edge's own time: all stages but the LLM", buckets=_OVERHEAD_BUCKETS
+            "aicvds_overhead_seconds", "All stages but the LLM", buckets=_OVERHEAD_BUCKETS
         )
         self._add_llm()
         self.tokens_saved = counter("aicvds_tokens_saved", "Tokens saved by attention, masks and short rows")
@@ -97,14 +97,10 @@ class Metrics:
         self.tasks = gauge("aicvds_tasks", "Tasks of the event loop")
         self.alarms = gauge("aicvds_alarms", "UAVs and sensors of which a mission's page shows an alarm", ["kind"])
         self.missions = gauge("aicvds_missions", "Missions in memory or in the store")
-        self.store_seconds = histogram(
-            "aicvds_store_seconds", "Time of a commit to the store", buckets=_OVERHEAD_BUCKETS
-        )
+        self.store_seconds = histogram("aicvds_store_seconds", "Time of a commit", buckets=_OVERHEAD_BUCKETS)
         self.store_failures = counter("aicvds_store_failures", "Commits that failed; they are tried again")
         self.leases = gauge("aicvds_leases", "Missions that this edge owns in a shared store")
-        self.leases_taken_over = counter(
-            "aicvds_leases_taken_over", "Missions taken over from another edge, or from an earlier start"
-        )
+        self.leases_taken_over = counter("aicvds_leases_taken_over", "Missions of other edges or starts taken over")
         self.leases_lost = counter("aicvds_leases_lost", "Missions that another edge has taken over")
         # Looking up a child by its labels takes as long as counting; there are few children.
         self._decisions, self._seconds = cache(self.decisions.labels), cache(self.decision_seconds.labels)
@@ -113,44 +109,30 @@ class Metrics:
     def _add_llm(self) -> None:
         counter, gauge, histogram = self._kinds
         self.llm_requests = counter("aicvds_llm_requests", "Queries to the LLM by outcome", ["outcome"])
-        self.llm_breaker_opened = counter(
-            "aicvds_llm_breaker_opened", "Times that a circuit breaker of an LLM server opened"
-        )
+        self.llm_breaker_opened = counter("aicvds_llm_breaker_opened", "Times that an LLM server's breaker opened")
         self.llm_breaker_open = gauge("aicvds_llm_breaker_open", "LLM servers whose circuit breaker is open now")
         self.llm_servers = gauge("aicvds_llm_servers", "LLM servers by state", ["status"])
         self.llm_tokens = counter("aicvds_llm_tokens", "Tokens that the LLM server reported", ["kind"])
-        self.llm_trust = histogram(
-            "aicvds_llm_trust", "The LLM's weight among mode guided's advisers", buckets=_SHARE_BUCKETS
-        )
+        self.llm_trust = histogram("aicvds_llm_trust", "The LLM's weight in mode guided", buckets=_SHARE_BUCKETS)
         self.evaluator_timeouts = counter(
-            "aicvds_critic_timeouts", "Decisions of mode guided whose rollout evaluator was late or failed"
+            "aicvds_critic_timeouts", "Decisions whose rollout evaluator was late or failed"
         )
         self.keys_lost = gauge(
-            "aicvds_keys_lost", "Whether the file of API keys cannot be read and the previous keys apply"
+            "aicvds_keys_lost", "Whether the file of API keys is unreadable: the previous keys apply"
         )
 
     def _add_outcomes(self) -> None:
         """The metrics of outcomes and reports."""
         counter, gauge, histogram = self._kinds
         self.feedback = counter("aicvds_feedback", "Outcomes received", ["result"])
-        self.costs_clipped = counter(
-            "aicvds_costs_clipped", "Outcomes whose cost exceeded the largest possible cost of a step"
-        )
+        self.costs_clipped = counter("aicvds_costs_clipped", "Outcomes with a cost above the largest of a step")
         self.learner_loss = gauge("aicvds_learner_loss", "Latest value-regression loss of any mission")
-        self.learner_update_loss = Summary(
-            "aicvds_learner_update_loss", "Value-regression loss of every update", registry=self.registry
-        )
-        self.overflow_risk = histogram(
-            "aicvds_overflow_risk",
-            "At each decision, the share of sensors that are expected to overflow before their next visit",
-            buckets=_SHARE_BUCKETS,
-        )
-        self.link_excess_db = ArrayHistogram(
-            "aicvds_link_excess_db",
-            "Path loss measured by beacons minus the formula's, dB",
-            registry=self.registry,
-            buckets=_EXCESS_BUCKETS_DB,
-        )
+        r, every = self.registry, "Value-regression loss of every update"
+        self.learner_update_loss = Summary("aicvds_learner_update_loss", every, registry=r)
+        risk = "At each decision, the share of sensors that are expected to overflow before their next visit"
+        self.overflow_risk = histogram("aicvds_overflow_risk", risk, buckets=_SHARE_BUCKETS)
+        excess = "Path loss measured by beacons minus the formula's, dB"
+        self.link_excess_db = ArrayHistogram("aicvds_link_excess_db", excess, registry=r, buckets=_EXCESS_BUCKETS_DB)
         self.radio_failures = counter("aicvds_radio_failures", "Transmissions that failed over a good link")
         self.readings = counter("aicvds_readings", "Sensors' own readings by result", ["result"])
 

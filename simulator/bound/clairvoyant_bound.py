@@ -171,13 +171,15 @@ def mission_bound(site: Site, seed: int, steps_flown: int, time_limit_s: float) 
         return "this world is too large for a short search; try `aicvds bound`"
     if scenario.wind_mps or scenario.gust_mps:
         return "in wind no plan is flown as made"
-    from simulator.bound.solver import Interrupted
-
     try:
+        from simulator.bound.solver import Interrupted
+
         try:
             bound = clairvoyant(site, seed, time_limit_s)
         except Interrupted as stopped:
             bound = confirmed(site, seed, stopped.plan)
     except ModuleNotFoundError:
         return "OR-Tools is not installed; pip install 'aic-vds[bound]'"
+    except KeyboardInterrupt:
+        return "the search was interrupted"
     return LossBound(lower_bound=bound.lower_bound, best_flight=bound.lost_packets, seconds=round(bound.seconds, 3))

@@ -26,7 +26,7 @@ from simulator.errors import INTERRUPTED, UsageError
 from simulator.flying.job import BASELINES, BOUND_S, EDGE_MODE, Job, new_mission_id
 from simulator.flying.local_edge import edge_in_folder
 from simulator.flying.run import run_mission
-from simulator.records.run_folder import fresh_folder, refuse_old_result
+from simulator.records.run_folder import DECISIONS, fresh_folder, refuse_old_result
 
 # The options that a job has under the same name.
 _PASSED_ON = ("seed", "note", "uplink", "deadline_ms", "wait_s", "reconnect_s")
@@ -134,6 +134,7 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
     mission_id = options.mission or new_mission_id(site.scenario, options.seed)
     out = options.out or Path("runs") / mission_id
     refuse_old_result(out, options.overwrite)
+    refuse_old_result(out, options.overwrite, DECISIONS)
     own_mode = _mode_of(options.policy)
     with ExitStack() as stack:
         edge, alive = options.edge, _no_edge

@@ -199,8 +199,8 @@ def _others(
                     await_edge(edge, job.wait_s, console, alive, job.wait_out)
                     tally = _fly_again(job, cast(Mode, name.removeprefix(EDGE_MODE)), edge, console)
                 flown[name] = tally[: flight.steps_flown]
-        except (EdgeError, ValueError) as error:
-            print(f"{name} was not flown: {error}", file=sys.stderr)
+        except Exception as error:  # A user's own policy may raise anything.
+            print(f"{name} was not flown: {str(error) or type(error).__name__}", file=sys.stderr)
         except KeyboardInterrupt:
             print(f"{name} was not flown to its end: interrupted", file=sys.stderr)
             break

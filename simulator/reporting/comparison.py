@@ -86,7 +86,7 @@ def rows(runs: Sequence[MissionResult]) -> dict[str, list[str]]:
 
 def caution(runs: Sequence[MissionResult]) -> str:
     """What the losses of these runs can be compared for."""
-    worlds = {(run.summary.scenario, run.summary.seed, run.summary.steps_flown) for run in runs}
+    worlds = {(s.scenario, s.seed, s.steps_flown, s.sensors, s.uavs) for s in (run.summary for run in runs)}
     if any(run.summary.real_uavs is not None for run in runs):
         return "Real UAVs know only the losses that beacons reported, so these losses cannot be compared."
     if len(worlds) > 1:

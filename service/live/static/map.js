@@ -86,6 +86,8 @@ export class MissionMap {
     points.push(...mission.pipeline, ...mission.places.filter((place) => place[0] !== null));
     const low = [0, 1].map((axis) => points.reduce((least, p) => Math.min(least, p[axis]), Infinity));
     const high = [0, 1].map((axis) => points.reduce((most, p) => Math.max(most, p[axis]), -Infinity));
+    // A world along one parallel or meridian has a height or width too.
+    high.forEach((most, axis) => most > low[axis] || (high[axis] = low[axis] + 1));
     const width = Math.max(200, this.svg.clientWidth);
     this.scale = (width - 2 * MARGIN_PX) / (high[0] - low[0]);
     const tallest = Math.min(width * 1.25, Math.max(320, 0.62 * innerHeight));

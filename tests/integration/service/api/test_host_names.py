@@ -60,6 +60,8 @@ def test_two_names_are_refused(edge: Edge) -> None:
         ({"hosts": "edge"}, "edge.example", 403),
         ({"hosts": "edge"}, "localhost", 200),
         ({"hosts": "edge:8000"}, "edge:8000", 200),
+        ({"hosts": "[fd00::1]", "anonymous": "off"}, "[fd00::1]:8000", 200),
+        ({"hosts": "[fd00::1]:8000", "anonymous": "off"}, "[fd00::1]", 200),
         ({"hosts": "*"}, "evil.example", 200),
         ({"anonymous": "on"}, "192.0.2.1:8000", 200),
         ({"anonymous": "on"}, "evil.example", 403),

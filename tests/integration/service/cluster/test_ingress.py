@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import AsyncIterator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -190,3 +191,20 @@ def test_a_fault_of_the_ingress_is_a_problem_too() -> None:
     with ingress(Replies(ValueError("x"))) as client:
         failed = client.get("/missions/m")
     assert (failed.status_code, failed.headers["content-type"]) == (500, "application/problem+json")
+
+
+def test_of_a_remembered_owner_that_goes_every_request_is_answered() -> None:
+    with serving(
+        Starlette(routes=[Route("/{path:path}", lambda request: Response("{}", 421), methods=["POST"])])
+    ) as gone:
+        owners = Replies(Answer(421, [(b"location", f"{gone}/decide".encode())], b"{}"))
+        with ingress(owners) as client, ThreadPoolExecutor(8) as pool:
+            client.post("/decide", json={"step": 0})
+            owners.answer = Answer(200, [], b"{}")
+            answers = list(pool.map(lambda step: client.post("/decide", json={"step": step}), range(8)))
+    assert {answer.status_code for answer in answers} == {200}
+
+
+def test_a_deeply_nested_body_is_for_its_owner_to_refuse() -> None:
+    with ingress(Replies(Answer(400, [], b"{}"))) as client:
+        assert client.post("/decide", content=b"[" * 5000).status_code == 400

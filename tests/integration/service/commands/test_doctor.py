@@ -150,3 +150,21 @@ def test_no_proxy_ends_in_a_traceback(monkeypatch: pytest.MonkeyPatch, named: st
     monkeypatch.setenv("ALL_PROXY", named)
     [found] = doctor.llm_servers(Settings(llm_url="http://llm.example/v1"))
     assert found.remedy is not None and ("proxy" in found.found or "port" in found.found)
+
+
+def test_keys_without_a_key_and_a_missing_adapter_for_notes_are_in_the_way(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "keys.json").write_text('{"keys": []}')
+    monkeypatch.setenv("AICVDS_MODE", "value")
+    monkeypatch.setenv("AICVDS_KEYS", str(tmp_path / "keys.json"))
+    assert len([one for one in doctor.findings({"port": 0}) if one.what == "keys"]) == 1
+    model = tmp_path / "model.gguf"
+    model.touch()
+    found, *_ = doctor.embedded(Settings(llm_gguf=model, llm_adapter="off", llm_orders=str(tmp_path / "none.gguf")))
+    assert "none.gguf is not there" in found.found and "AICVDS_LLM_ORDERS" in (found.remedy or "")
+
+
+def test_a_home_that_is_not_there_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/nonexistent/home")
+    assert "MB of disk free" in doctor.planner(Settings(store="none")).found

@@ -118,3 +118,19 @@ def test_a_mission_deleted_while_it_wakes_stays_deleted(
         gate.open()
         assert (got.result().status_code, deleted.result().status_code, decided.result().status_code) == (200, 204, 200)
         assert client.get("/missions/test").json()["decisions"] == 1
+
+
+def test_a_mission_whose_deletion_is_under_way_does_not_come_back(postgres: str, report: Report) -> None:
+    with Gate() as gate, running(postgres) as (client, engine), ThreadPoolExecutor(2) as pool:
+        fly(client, report, range(2))
+        commits: Any = engine.journal._commits  # type: ignore[union-attr]
+        commits._writer._jobs.put(gate.wait)
+        until(lambda: gate.came)
+        deleted = pool.submit(client.delete, "/missions/test")
+        until(lambda: commits._queue)
+        asked = pool.submit(client.get, "/missions/test")
+        with pytest.raises(TimeoutError):
+            asked.result(0.2)
+        gate.open()
+        assert (deleted.result().status_code, asked.result().status_code) == (204, 404)
+        assert client.get("/missions/test").status_code == 404

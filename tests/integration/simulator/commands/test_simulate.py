@@ -327,3 +327,27 @@ def test_a_flight_is_written_though_what_it_is_compared_with_fails(
     assert set(summary_in(out).lost_packets) == {"eof", "wqcs", "round_robin"}
     printed = capsys.readouterr().err
     assert f"{failing} was not flown: UAV 0, step 0" in printed and "edge:policy was not flown: no edge" in printed
+
+
+BAD_POLICY = """
+class Fullest:
+    def reset(self, scenario, seed):
+        pass
+
+    def decide(self, uav, observation, taken):
+        raise IndexError
+"""
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_policy_that_raises_costs_no_flight_and_a_killed_flights_log_is_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bad.py").write_text(BAD_POLICY, "utf-8")
+    flight = ["--policy", "eof", "--no-bound", "--steps", "2", "--out", str(tmp_path / "run")]
+    assert simulate.main([*flight, "--against", f"{tmp_path}/bad.py:Fullest"]) == 0
+    assert "bad.py:Fullest was not flown: IndexError" in capsys.readouterr().err
+    assert set(summary_in(tmp_path / "run").lost_packets) == {"eof", "wqcs"}
+    (tmp_path / "run" / "summary.json").unlink()
+    assert simulate.main(flight) == 2
+    assert "already has a decisions.jsonl" in capsys.readouterr().err

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
 import pytest
 
-from service.llm.answer_reading import completion_of
+from service.llm.answer_reading import completion_of, streamed
 from service.llm.answers import NoDecision
 
 
@@ -92,3 +93,23 @@ def test_no_error_quotes_the_key() -> None:
 def test_a_hostile_text_is_read_in_time_linear_in_its_length(text: str) -> None:
     # A quadratic reader would take minutes, and the test's time limit ends it.
     assert completion_of({"choices": [{"message": {"content": text}}]}, "http://llm").text is not None
+
+
+@pytest.mark.parametrize("first", ["A", "Okay"])
+def test_of_thoughts_given_apart_no_token_is_the_answers(first: str) -> None:
+    """vLLM with a reasoning parser: the text without the thoughts, the log-probabilities with them."""
+    content = [
+        position(first, entry("A", 0.5), entry("Okay", 0.4)),
+        position("</think>", entry("</think>", 0.99)),
+        position("\n\n", entry("\n\n", 0.99)),
+        position("C", entry("A", 0.01), entry("C", 0.96)),
+    ]
+    body = {"choices": [{"message": {"content": "C", "reasoning_content": "A ..."}, "logprobs": {"content": content}}]}
+    read = completion_of(body, "url")
+    assert read.text == "C" and read.positions[0].likeliest["C"] == pytest.approx(0.96)
+
+
+def test_a_stream_may_have_any_separator_in_its_text() -> None:
+    parts = [{"choices": [{"delta": {"content": text}}]} for text in ("0\u2028", "\u0085 7")]
+    events = "".join(f"data: {json.dumps(part, ensure_ascii=False)}\r\n\r\n" for part in parts)
+    assert completion_of(streamed(events.encode()), "url").text == "0\u2028\u0085 7"

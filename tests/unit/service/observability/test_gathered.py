@@ -1,6 +1,7 @@
 """Several processes' metrics as one text."""
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from prometheus_client.openmetrics.parser import text_string_to_metric_families as openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 
 from service.cluster.exchange import gathered
@@ -36,3 +37,9 @@ def test_the_edges_own_metrics_are_gathered() -> None:
     assert {s.labels["process"] for s in families["aicvds_missions"].samples} == {"0", "1"}
     assert families["aicvds_link_excess_db"].type == "histogram"
     assert not gathered({})
+
+
+def test_openmetrics_of_several_edges_is_openmetrics() -> None:
+    texts = {slot: Metrics().exposed("application/openmetrics-text; version=1.0.0")[0].decode() for slot in "01"}
+    families = list(openmetrics(gathered(texts)))  # type: ignore[no-untyped-call]
+    assert {s.labels["process"] for family in families for s in family.samples} == {"0", "1"}

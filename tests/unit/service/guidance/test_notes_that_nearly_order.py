@@ -1,0 +1,119 @@
+"""Notes that say the opposite of the order in them, or less of it, and lists with ranges; phrases alone read them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+
+import pytest
+
+from service.guidance import note_phrases
+from service.guidance.note_phrases import PhrasedNote
+from shared.planning.orders import NO_GUIDANCE
+from shared.world.scenario import SCENARIOS
+
+PAPER = SCENARIOS["paper"]
+
+
+def read(note: str) -> tuple[str, list[str], list[str]]:
+    """The orders in words, the names withdrawn, and the doubts."""
+    phrased = PhrasedNote(note, PAPER, ())
+    guidance, doubts = phrased.completed(NO_GUIDANCE, frozenset())
+    return guidance.in_words() if guidance else "", list(phrased.withdrawn), phrased.unsaid + doubts
+
+
+@pytest.mark.parametrize(
+    ("note", "sensors"),
+    [
+        ("Ignore sensors 1 and 3-5.", [1, 3, 4, 5]),
+        ("Ignore sensors 1-3 and 5-7.", [1, 2, 3, 5, 6, 7]),
+        ("Visit sensors 1, 3-5 every 4 steps.", [1, 3, 4, 5]),
+        ("Visit S2-S4 every 3 steps.", [2, 3, 4]),
+        ("Visit sensors 3, 5 & 7 every 4 steps.", [3, 5, 7]),
+        ("Visit sensors 3 through 5 every 4 steps.", [3, 4, 5]),
+    ],
+)
+def test_a_list_may_have_ranges(note: str, sensors: list[int]) -> None:
+    words, withdrawn, doubts = read(note)
+    assert (withdrawn, doubts) == ([], [])
+    assert [sensor for sensor in range(10) if f"sensor {sensor} " in words] == sensors
+
+
+@pytest.mark.parametrize(
+    "note",
+    [
+        "Do not, under any circumstances, ignore sensor 4.",
+        "Never, ever, ignore sensor 4.",
+        "Forbidden: ignore sensor 4.",
+        "Bob said: ignore sensor 4.",
+        "No drone may, at any time, fly at least 10 m/s.",
+        "Yesterday's order: fly at most 5 m/s.",
+        "Visit sensor 4 every 3 steps. Cancel that.",
+        "Visit sensor 4 every 3 steps. Just kidding!",
+        "Nobody may cancel my orders.",
+        "There is no reason to cancel the orders.",
+        "Over the village, fly at most 5 m/s.",
+        "While it rains, fly at most 5 m/s.",
+        "On Monday, ignore sensor 4.",
+        "Drone B: ignore sensor 4.",
+        "Visit sensor 4 every 3 steps, not until 14:30.",
+        "Visit sensor 4 every 3 steps, not before 9 am.",
+        "Ignore sensor 4 until step 10, then visit sensor 5 every 3 steps.",
+        "Fly at most 10 m/s for the next hour.",
+        "Fly at most 10 m/s for the rest of the day.",
+        "Visit sensor 4 every 3 steps until 14:30 UTC.",
+        "Visit sensor 4 every 3 steps until 1.12.2026.",
+        "Visit sensor 4 every 3 steps until 3 pm Friday.",
+    ],
+)
+def test_what_may_be_denied_or_is_of_another_place_or_time_has_a_doubt(note: str) -> None:
+    assert read(note)[2]
+
+
+@pytest.mark.parametrize(
+    ("note", "words"),
+    [
+        ("Ignore sensor 4.", "Ignore what sensor 4 loses."),
+        ("Fly at most 10 m/s until step 1,200.", "Never fly faster than 10 m/s, until step 1200."),
+        ("In general, fly at most 5 m/s.", "Never fly faster than 5 m/s."),
+        ("Please, visit sensor 4 every 3 steps.", "Visit sensor 4 at least once in every 3 steps."),
+    ],
+)
+def test_a_plain_order_has_no_doubt(note: str, words: str) -> None:
+    assert read(note) == (words, [], [])
+    assert read("Cancel all orders.") == ("", ["*"], [])
+
+
+@pytest.fixture
+def berlin(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("TZ", "Europe/Berlin")
+    time.tzset()
+    yield
+    monkeypatch.undo()
+    time.tzset()
+
+
+@pytest.mark.usefixtures("berlin")
+@pytest.mark.parametrize(
+    ("now", "until", "offset_h"),
+    [
+        (datetime(2026, 10, 24, 20, 0), "14:30", 1),
+        (datetime(2027, 3, 27, 20, 0), "8 am", 2),
+        (datetime(2027, 7, 1, 6, 0), "8 am", 2),
+    ],
+)
+def test_a_time_of_tomorrow_is_in_tomorrows_zone(
+    monkeypatch: pytest.MonkeyPatch, now: datetime, until: str, offset_h: int
+) -> None:
+    class Clock(datetime):
+        @classmethod
+        def now(cls, tz: object = None) -> datetime:  # type: ignore[override]
+            return now
+
+    monkeypatch.setattr(note_phrases, "datetime", Clock)
+    phrased = PhrasedNote(f"Visit sensor 4 every 3 steps until {until}.", PAPER, ())
+    guidance, doubts = phrased.completed(NO_GUIDANCE, frozenset())
+    [end] = guidance.ends.values()
+    assert doubts == [] and end.time is not None
+    assert end.time.utcoffset() == timedelta(hours=offset_h)
