@@ -52,7 +52,7 @@ class RecentDecisions:
     """Decisions by ID, oldest first. An entry refers to existing objects.
 
     Attributes:
-        decided_at: time of the newest, seconds of the machine's monotonic clock; 0 before the first.
+        decided_at: time of the newest, Unix seconds, to compare with other machines'; 0 before the first.
     """
 
     def __init__(self) -> None:
@@ -65,7 +65,7 @@ class RecentDecisions:
     def decided(self, position: tuple[float, float], prompt: Prompt, answer: DecideResponse) -> None:
         """Add an answered decision."""
         self.order += 1
-        self.decided_at = time.monotonic()
+        self.decided_at = time.time()
         blocks = Blocks(prompt.static, prompt.experiences, prompt.state)
         decision = RecentDecision(answer.mission_id, position, blocks, answer, self.order)
         self._decisions[answer.decision_id] = decision
