@@ -56,7 +56,11 @@ class Llm:
         return self.available if backing == NAMED_BY_OPTION else True
 
     def identity(self, backing: Backing) -> str:
-        """The LLM in a flight's key; LLMs of one identity answer alike."""
+        """What decides behind an edge, in a flight's key: the LLM, and the weights with which the modules begin."""
+        return f"{self._llm_of(backing)} {_modules()}"
+
+    def _llm_of(self, backing: Backing) -> str:
+        """The LLM; LLMs of one name answer alike."""
         if backing in (OFF, *STAND_INS):
             return backing
         if backing == NAMED_BY_OPTION:
@@ -159,10 +163,20 @@ def radio(url: str, deadline_ms: int | None, scenario: Scenario, seed: int) -> E
 
 def _adapter() -> Path:
     """Where the adapter's file is, or would be."""
-    if named := os.environ.get(_ADAPTER):
-        return Path(named).resolve()
+    named = os.environ.get(_ADAPTER)
+    return Path(named).resolve() if named else _checkpoints() / "adapter.gguf"
+
+
+def _checkpoints() -> Path:
+    """The folder of the weights that ship."""
     service = find_spec("service")
-    return Path((service and service.origin) or "").parent / "checkpoints" / "adapter.gguf"
+    return Path((service and service.origin) or "").parent / "checkpoints"
+
+
+@cache
+def _modules() -> str:
+    """The hash of the weights that ship for attention and velocities, so that an edge with new ones flies again."""
+    return hashlib.sha256("".join(map(_sha256, sorted(_checkpoints().glob("*.npz")))).encode()).hexdigest()[:16]
 
 
 @cache

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from lab.experiments.edges import Llm, _sha256, edge_for, environment_for
-from lab.experiments.schemes import ADAPTED, CHANCE, NAMED_BY_OPTION, OFF, WORST, Backing
+from lab.experiments.schemes import ADAPTED, CHANCE, CHANCE_AS_ADAPTED, NAMED_BY_OPTION, OFF, WORST, Backing
 
 SERVER = "http://127.0.0.1:8080/v1"
 
@@ -81,7 +81,9 @@ def test_llms_that_may_answer_differently_have_different_identities(tmp_path: Pa
     (tmp_path / "m.gguf").write_bytes(b"two")
     files = [Llm().identity(str(path)) for path in (tmp_path / "m.gguf", tmp_path / "a" / "m.gguf")]
     named = [llm.identity(NAMED_BY_OPTION) for llm in (Llm(), Llm(SERVER), Llm(edge="http://e:8000"))]
-    assert named[0] == "embedded" and named[1] == f"{SERVER} big"
+    assert named[0].startswith("embedded ") and named[1].startswith(f"{SERVER} big ")
+    # All edges begin with the same weights of their modules.
+    assert len({name.rpartition(" ")[2] for name in (*files, *named, Llm().identity(OFF))}) == 1
     assert len({*files, *named, Llm().identity(OFF), Llm().identity(CHANCE)}) == 7
 
 
@@ -91,7 +93,7 @@ def test_whether_there_is_an_llm_to_ask() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("backing", [CHANCE, WORST])
+@pytest.mark.parametrize("backing", [CHANCE, CHANCE_AS_ADAPTED, WORST])
 def test_an_edge_takes_a_stand_in_for_an_llm(backing: Backing, tmp_path: Path) -> None:
     with edge_for(backing, Llm(), tmp_path / "edge.log", Console(quiet=True)) as edge:
         assert edge.model
