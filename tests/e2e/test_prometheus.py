@@ -236,4 +236,6 @@ def test_every_expression_returns_data_while_a_mission_flies(tmp_path: Path) -> 
         assert {(target["labels"]["job"], target["health"]) for target in targets} == {
             ("edge", "up"),
             ("simulator", "up"),
+            # Its container runs in the profile mqtt alone.
+            ("uplinks", "down"),
         }

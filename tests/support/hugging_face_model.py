@@ -17,7 +17,8 @@ def write(folder: Path) -> None:
     from lab.distilling.student import Student
 
     student = Student(embedded_model(Settings()), static="", rank=8, device="cpu", begin=SHIPPED_ADAPTER)
-    merged = student.model.merge_and_unload().float()
+    # In 32 bits before the sum: 16 bits would round the adapter away.
+    merged = student.model.float().merge_and_unload()
     merged.config.use_cache = True
     merged.save_pretrained(folder)
     student.tokenizer.save_pretrained(folder)
