@@ -248,14 +248,11 @@ def _saved(result: Result, block: str) -> tuple[Interval | Paired, int]:
 def _token_counts(result: Result, runs: Runs) -> Judged:
     name = _method_in(result)
     unattended = measured(result, UNATTENDED, "prompt_tokens") is not None
+    whole, counted = (UNATTENDED, "tokens") if unattended else (name, "uncompressed")
     ours = "; ".join(
-        f"{what} {whole.mean:.1f} to {interval_of(result, name, f'{block}_tokens').mean:.1f}"
+        f"{what} {interval_of(result, whole, f'{block}_{counted}').mean:.1f}"
+        f" to {interval_of(result, name, f'{block}_tokens').mean:.1f}"
         for what, block in (("prompt", "prompt"), ("state block", "state"))
-        for whole in [
-            interval_of(result, UNATTENDED, f"{block}_tokens")
-            if unattended
-            else interval_of(result, name, f"{block}_uncompressed")
-        ]
     )
     why = "another wording and row format; only the ratio can be compared"
     return Judged(ours, Verdict.NOT_COMPARABLE, why, seeds_flown(result, name))

@@ -139,16 +139,16 @@ async def _answers_lists(
 
 async def _answer(client: LLMClient, body: dict[str, Any]) -> Completion | None:
     """The answer to a probe, None if it fails; raises :class:`Unreachable`."""
-    try:
-        return await client.complete(body)
-    except Unreachable:
-        raise
-    except Busy as busy:
-        # It says nothing of what the server can do.
-        await asyncio.sleep(busy.pause_s)
-        return await _answer(client, body)
-    except NoDecision:
-        return None
+    while True:
+        try:
+            return await client.complete(body)
+        except Unreachable:
+            raise
+        except Busy as busy:
+            # It says nothing of what the server can do.
+            await asyncio.sleep(busy.pause_s)
+        except NoDecision:
+            return None
 
 
 async def _listed_model(client: LLMClient) -> str | None:
