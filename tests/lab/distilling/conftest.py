@@ -4,9 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 import pytest
+
+from lab.distilling.examples import PromptExample, View, missions_of, prompt_examples
+from lab.exploration.exploration import explore
+from lab.exploration.rollouts import Header, read_rollouts, write_rollouts
+from shared.world.scenario import SCENARIOS
+
+SHORT = SCENARIOS["paper"].model_copy(update={"steps": 5})
 
 
 @pytest.fixture(scope="package")
@@ -30,3 +38,16 @@ def _remembered(load: Any) -> Any:
         return deepcopy(read[key])
 
     return loaded
+
+
+@pytest.fixture(scope="module")
+def rollouts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("rollouts") / "paper.jsonl.gz"
+    steps = [step for mission in range(60_000, 60_003) for step in explore(SHORT, mission, "planner")]
+    write_rollouts(file, Header(scenario=SHORT, missions=3, behaviour="test"), steps)
+    return file
+
+
+def examples_in(view: View, rollouts: Path) -> list[list[PromptExample]]:
+    header, steps = read_rollouts(rollouts)
+    return [prompt_examples(header, mission, view) for mission in missions_of(steps)]
