@@ -24,8 +24,15 @@ EXPERIMENT = Experiment(
     schemes=_schemes,
     measures=(*LOSSES, "failures", "overflows", "state_tokens", "prompt_tokens", "llm_decided_pct"),
     figures=(
-        FigureSpec("attention", "curves", LOSS_CURVES, "With attention (k = 5) and without: what is lost."),
-        FigureSpec("attention_totals", "bars", LOSSES, "With attention (k = 5) and without: losses of a mission."),
+        FigureSpec(
+            "attention", "curves", LOSS_CURVES, "With attention (k = 5) and, where an LLM flies, without: what is lost."
+        ),
+        FigureSpec(
+            "attention_totals",
+            "bars",
+            LOSSES,
+            "With attention (k = 5) and, where an LLM flies, without: a mission's losses.",
+        ),
     ),
     pairs=(
         ("llm", "llm_all"),

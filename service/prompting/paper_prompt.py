@@ -65,7 +65,7 @@ class Template:
 
     def experience(self, seen: Cells, action: Action, cost: float, failed: bool) -> str:
         """A line of the experiences: the chosen sensor's row, the decision and its cost, which includes a failure."""
-        return experience(seen, f"{action.sensor_id} {action.velocity}", f"{cost:.1f}")
+        return experience(seen, f"{action.sensor_id} {action.velocity}", f"{cost:.2f}")
 
     def unreported_row(self, sensor_id: int) -> Cells:
         """The row of a sensor that the report lacks."""

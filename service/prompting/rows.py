@@ -94,7 +94,7 @@ def row(cells: Cells) -> str:
 
 
 def experience(cells: Cells, answer: str, cost: str) -> str:
-    """The line of a past decision, such as ``52,48,-90,140,2,61,40 > 3 9: 0.0``: a row without ID, answer, cost."""
+    """The line of a past decision, such as ``52,48,-90,140,2,61,40 > 3 9: 0.00``: a row without ID, answer, cost."""
     return f"{','.join(text for name, text in cells.items() if name != 'sensor_id')} > {answer}: {cost}\n"
 
 

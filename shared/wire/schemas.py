@@ -334,7 +334,7 @@ class MissionSpec(Received):
         "battery); default: the service's",
     )
     prompt: PromptStyle = PromptStyle()
-    init: Init = Field("pretrained", description="the modules' initial weights; `random` is the paper's start")
+    init: Init = Field("pretrained", description="the modules' initial weights; `random` as the paper suggests")
     seed: int = Field(0, ge=0, lt=2**32, description="of random initial weights and of shuffled rows")
     note: Note | None = Field(
         None,

@@ -1,6 +1,6 @@
 """The hand-written policies.
 
-EOF and WQCS are the paper's; docs/reference/method.md has our readings where its text is open. Their velocity follows
+EOF and WQCS are the paper's; docs/results/paper.md has our readings where its text is open. Their velocity follows
 the distance to the chosen sensor, by the velocity strategy of the paper's prompt. Its UAVs choose independently; a
 coordinated scheme also leaves out the sensors that earlier UAVs of the step chose. All others fly at 7 m/s throughout,
 but for the random one.

@@ -87,7 +87,7 @@ def test_rows_are_sorted_by_score_and_say_what_is_known() -> None:
 
 def test_experiences_stand_between_static_and_state() -> None:
     last = flown()[-1]
-    line = "20,50,-90,100,0,17,0 > 1 7: 0.1\n"
+    line = "20,50,-90,100,0,17,0 > 1 7: 0.12\n"
     assert last.experiences.startswith(line)
     assert last.user == last.experiences + last.state
 
