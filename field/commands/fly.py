@@ -1,7 +1,5 @@
 """``aicvds fly``: fly the missions of real UAVs over MAVLink, at the speeds that an edge decides."""
 
-from __future__ import annotations
-
 import asyncio
 import shlex
 from dataclasses import dataclass
@@ -136,7 +134,7 @@ def fly(options: Fly, command: str, console: Console) -> int:
     return code
 
 
-def job_from_options(options: Fly) -> FieldJob:
+def job_from_options(options: Fly) -> "FieldJob":
     """The flight that the options describe; raises ``UsageError`` for the first that is unusable."""
     mission_id = check(options)
     edge = edge_from_option(options.edge)
@@ -201,7 +199,7 @@ def listened_at(url: str) -> str:
     return f"UDP port {place.rpartition(':')[2]}" if scheme in ("udp", "udpin") else url
 
 
-def checked_site(options: Fly) -> Site:
+def checked_site(options: Fly) -> "Site":
     """The world; raises ``UsageError`` if it is unusable or has no trajectory for one of the UAVs."""
     site = site_from_options(None, options.world, options.steps)
     last = site.scenario.uavs - len(options.mavlink)
@@ -215,7 +213,7 @@ def checked_site(options: Fly) -> Site:
     return site
 
 
-def conclude(flown: RealFlight, job: FieldJob, command: str, console: Console) -> None:
+def conclude(flown: "RealFlight", job: "FieldJob", command: str, console: Console) -> None:
     """Write a flight's summary and report, and print its outcome; raises ``UsageError``: the folder is unusable."""
     from field.vehicles.radio import SimulatedRadio
     from simulator.records.real_uavs import RealUavs, sums_by_uav

@@ -1,7 +1,5 @@
 """``aicvds mqtt``: readings of LoRaWAN sensors, from an MQTT broker to an edge."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal
@@ -74,7 +72,7 @@ def main(argv: list[str]) -> int:
     return _forward(configuration, options)
 
 
-def _forward(configuration: Configuration, options: Mqtt) -> int:
+def _forward(configuration: "Configuration", options: Mqtt) -> int:
     from prometheus_client import start_http_server
 
     from field.lorawan.edge_sender import EdgeSender
@@ -107,7 +105,7 @@ def _forward(configuration: Configuration, options: Mqtt) -> int:
     return 0
 
 
-def _in_words(configuration: Configuration) -> str:
+def _in_words(configuration: "Configuration") -> str:
     missions = sorted({configuration.mission_of(device) for device in configuration.device})
     shown = ", ".join(missions[:5]) + (f" and {len(missions) - 5} more" if len(missions) > 5 else "")
     network = configuration.network

@@ -103,7 +103,7 @@ class Subscription:
 
     def _received(self, client: Client, _: Any, message: MQTTMessage) -> None:
         try:
-            log.debug("%s: %s", message.topic, self._pending.add_message(bytes(message.payload), topic=message.topic))
+            log.debug("%r: %s", message.topic, self._pending.add_message(bytes(message.payload), topic=message.topic))
         except Exception:
             # An error would end the client's thread, and no further message would come.
             log.exception("a message could not be processed")

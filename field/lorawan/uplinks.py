@@ -113,7 +113,7 @@ _STATUS = frozenset(("margin", "battery_level", "battery_level_unavailable", "ex
 def chirpstack(payload: bytes) -> DeviceMessage:
     """An event ``up`` or ``status`` of ChirpStack v4 in JSON; raises pydantic's ``ValidationError``."""
     event = _ChirpStack.model_validate_json(payload)
-    unknown = event.external_power_source or event.battery_level_unavailable
+    known = None if event.battery_level_unavailable else event.battery_level
     is_status = not _STATUS.isdisjoint(event.model_fields_set)
     return DeviceMessage(
         dev_eui=event.dev_eui.lower(),
@@ -123,7 +123,8 @@ def chirpstack(payload: bytes) -> DeviceMessage:
         at=event.ns_time or event.time,
         fields={} if event.object is None and not is_status else event.object,
         has_battery=is_status,
-        battery_percent=None if unknown else event.battery_level,
+        # Where it gets none, the edge keeps the battery that it knew.
+        battery_percent=100.0 if event.external_power_source else known,
         **_best_reception(event.rx_info),
     )
 

@@ -17,7 +17,7 @@ import numpy as np
 from field.errors import VehicleError
 from field.vehicles.field_pilot import FieldPilot
 from field.vehicles.field_uav import LINK_LOST, NO_POSITION, FieldUav
-from field.vehicles.radio import Collected, LossCounters, Radio, Spot
+from field.vehicles.radio import Beacon, Collected, LossCounters, Radio, Spot
 from shared.wire.schemas import Mode
 from simulator.flying.pilots import PilotChoice
 from simulator.records.decision import Decision
@@ -27,6 +27,8 @@ from simulator.world.observation import StepTally
 
 # Parts of a step in which the speed is corrected; in the last one a new speed would take effect too late.
 _PARTS = 5
+# A UAV that was to fly and came less far in a step stays in place, metres.
+_IN_PLACE_M = 1.0
 
 T = TypeVar("T")
 
@@ -36,11 +38,9 @@ class Clock(Protocol):
 
     def now(self) -> float:
         """The present time, seconds."""
-        ...
 
     async def until(self, time_s: float) -> None:
         """Wait until then; not at all if it is over."""
-        ...
 
 
 class MissionClock:
@@ -208,6 +208,21 @@ class FieldFlight:
             self._on_event(uav.index, f"its radio fails: {type(error).__name__}: {error}".removesuffix(": "))
             return nothing
 
+    async def _beacons(self, spot: Spot) -> Mapping[int, Beacon]:
+        """The radio's beacons; raises ``ValueError`` where they are none."""
+        found = await self._radio.beacons(spot)
+        for sensor, beacon in found.items():
+            if not (sensor in range(self._scenario.sensors) and beacon.queue >= 0 and beacon.lost >= 0):
+                raise ValueError(f"sensor {sensor}: {beacon}")
+        return found
+
+    async def _collected(self, spot: Spot, sensor: int) -> Collected:
+        """The radio's packets; raises ``ValueError`` where they are none."""
+        found = await self._radio.collect(spot, sensor)
+        if found.packets < 0 or found.packets != int(found.packets):
+            raise ValueError(f"sensor {sensor}: {found}")
+        return Collected(int(found.packets), bool(found.failed))
+
     async def _collect(self, legs: Sequence[_Leg], step: int) -> None:
         """Collect in the order of the UAVs, hear the sensors at the next waypoint, and record the outcomes."""
         collected = {}
@@ -217,8 +232,11 @@ class FieldFlight:
             else:
                 decided_m, flown_m = self.result.metres.get(leg.uav.index, (0.0, 0.0))
                 decided_m += leg.choice.velocity * self._scenario.step_s
-                self.result.metres[leg.uav.index] = decided_m, flown_m + leg.uav.flown_m - leg.start_m
-            collecting = self._radio.collect(leg.uav.spot(step), leg.choice.sensor)
+                flew_m = leg.uav.flown_m - leg.start_m
+                self.result.metres[leg.uav.index] = decided_m, flown_m + flew_m
+                if leg.choice.velocity and abs(flew_m) < _IN_PLACE_M and leg.uav.unavailable_reason is None:
+                    self._on_event(leg.uav.index, "it stays in place in mode mission: its mission may have ended")
+            collecting = self._collected(leg.uav.spot(step), leg.choice.sensor)
             collected[leg.uav.index] = await self._received(leg.uav, collecting, Collected(0, failed=True))
         lost, grown = await self._listen(step + 1)
         for leg in legs:
@@ -258,7 +276,7 @@ class FieldFlight:
 
         Returns the packets that they lost: by UAV, since that UAV last heard them; by sensor, since any UAV did.
         """
-        heard = {uav.index: await self._received(uav, self._radio.beacons(uav.spot(step)), {}) for uav in self._uavs}
+        heard = {uav.index: await self._received(uav, self._beacons(uav.spot(step)), {}) for uav in self._uavs}
         counters: dict[int, int] = {}
         for beacons in heard.values():
             for sensor, beacon in beacons.items():

@@ -11,6 +11,7 @@ from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextma
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import TypeVar
 
 from field.errors import VehicleError
 from field.vehicles.field_flight import FieldFlight, MissionClock, RealFlight
@@ -27,6 +28,8 @@ from simulator.records.mission_logs import DecisionLog, RequestLog, with_edge_de
 from simulator.records.run_folder import DECISIONS, REQUESTS, fresh_folder, naming_out
 from simulator.sites.plans.mission_path import DELAY, JUMP, WAYPOINT, MissionItem, path_of, repeats_forever
 from simulator.sites.site import Site
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,8 @@ async def run_field_mission(job: FieldJob) -> RealFlight:
                 logs = stack.enter_context(open_logs(job, pilot))
                 flight = FieldFlight(
                     job.site, uavs, job.radio, pilot, MissionClock(job.speedup),
-                    lambda decision: log_decision(decision, logs), lambda uav, text: print_line(f"UAV {uav}: {text}"),
+                    flown_on(lambda decision: log_decision(decision, logs)),
+                    lambda uav, text: print_line(f"UAV {uav}: {text}"),
                 )  # fmt: skip
                 flight.result.warnings = warnings
                 flown = await flight.fly()
@@ -141,8 +145,20 @@ def open_logs(job: FieldJob, pilot: FieldPilot) -> Iterator[DecisionLog]:
         with naming_out(job.out):
             requests = stack.enter_context(RequestLog(job.out / REQUESTS, pilot.spec))
             decisions = stack.enter_context(DecisionLog(job.out / DECISIONS))
-        pilot.on_request = requests.append
+        pilot.on_request = flown_on(requests.append)
         yield decisions
+
+
+def flown_on(log: Callable[[T], None]) -> Callable[[T], None]:
+    """The same log, but a full disk costs its lines, not the flight."""
+
+    def write(entry: T) -> None:
+        try:
+            log(entry)
+        except OSError as error:
+            print_line(f"the log lacks a line: {error}")
+
+    return write
 
 
 def log_decision(decision: Decision, log: DecisionLog) -> None:
@@ -232,6 +248,10 @@ def doubts_of(items: Sequence[MissionItem], site: Site) -> list[str]:
             f"{world.altitude_m:g} m: the edge expects other links"
         )
     waits_s = sum(item.parameters[0] for item in items if item.command in (WAYPOINT, DELAY) and item.parameters[0] > 0)
+    if any(item.command == DELAY and item.parameters[0] < 0 for item in items):
+        doubts.append("it waits until a time of day, which no decision counts on")
+    if stops := [item.number for item in items if not item.autocontinue]:
+        doubts.append(f"autocontinue is off at items {stops}: the autopilot may stop there")
     if waits_s:
         doubts.append(f"it waits {waits_s:g} s at its waypoints, which no decision counts on")
     jump = next((item for item in items if item.command == JUMP), None)

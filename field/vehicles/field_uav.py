@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 
-from field.errors import VehicleError
+from field.errors import Unanswered, VehicleError
 from field.vehicles.mavlink_vehicle import FlightMode, Vehicle, VehicleState
 from field.vehicles.radio import HeardBeacons, Spot
 from shared.world.scenario import Point
@@ -139,7 +139,11 @@ class FieldUav:
     async def update(self, seconds: float) -> None:
         """Read the newest telemetry, that many seconds after the last."""
         self._since_located_s += seconds
-        state = await self.vehicle.state()
+        try:
+            state = await self.vehicle.state()
+        except VehicleError:
+            self.unavailable_reason = LINK_LOST
+            return
         self._mode, self._state = state.mode, state
         self.unavailable_reason = (
             self._control_fault(state) or self._position_fault(state.position) or self._climb_fault(state.height_m)
@@ -200,8 +204,13 @@ class FieldUav:
             # Where it cannot wait, the corrections slow it down.
             self._goal_m = goal_m
             if not self.waits:
-                await self.vehicle.hold()
+                # Before it answers: the answer may be lost, or the flight cancelled.
                 self.waits, self._mode_changed_s = True, time.monotonic()
+                try:
+                    await self.vehicle.hold()
+                except VehicleError as error:
+                    self.waits = isinstance(error, Unanswered)
+                    raise
             return
         await self.resume_mission()
         await self._set_speed(speed)

@@ -2,10 +2,8 @@
 
 ``MAV_CMD_DO_CHANGE_SPEED`` sets its speed. It waits and goes on by ``MAV_CMD_DO_PAUSE_CONTINUE`` on ArduPilot, and by
 ``MAV_CMD_DO_SET_MODE`` with the modes hold and mission elsewhere. None arms, takes off, lands or has a position.
-``MAV_CMD_SET_MESSAGE_INTERVAL`` asks for positions while none arrive, and for the landed state.
+``MAV_CMD_SET_MESSAGE_INTERVAL`` asks for positions while none arrive, for the landed state and the battery.
 """
-
-from __future__ import annotations
 
 import asyncio
 import json
@@ -16,7 +14,7 @@ from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
-from field.errors import VehicleError
+from field.errors import Unanswered, VehicleError
 from shared.world.scenario import Point
 from simulator.errors import UsageError
 from simulator.sites.plans.mission_path import MissionItem
@@ -28,7 +26,7 @@ STALE_S = 3.0
 # ArduPilot sends no position unasked: its stream rates are 0 until a ground station sets them (GCS_MAVLink_Parameters;
 # MAVSDK-Python 637), and again after it has started anew. So positions are asked for after this time without one.
 _ASK_S = 1.0
-_POSITIONS_HZ, _LANDED_HZ = 10.0, 1.0
+_POSITIONS_HZ, _SLOW_HZ = 10.0, 1.0
 # MAVSDK's own system ID unless another is asked for, and its number of a vehicle on the ground.
 _SYSTEM_ID, _ON_GROUND = 1, 1
 _PAUSE_CONTINUE, _UNSUPPORTED = 193, 3
@@ -77,23 +75,18 @@ class Vehicle(Protocol):
 
     async def state(self) -> VehicleState:
         """The newest telemetry; never waits for the vehicle."""
-        ...
 
     async def mission(self) -> list[MissionItem]:
         """The mission on board."""
-        ...
 
     async def set_speed(self, speed_m_s: float) -> None:
         """Fly along the mission at this ground speed, above 0."""
-        ...
 
     async def hold(self) -> None:
         """Wait in place, in the mission."""
-        ...
 
     async def resume(self) -> None:
         """Go on with the mission."""
-        ...
 
 
 def require_mavsdk() -> None:
@@ -109,7 +102,7 @@ def require_mavsdk() -> None:
 
 
 @asynccontextmanager
-async def mavlink_vehicle(url: str, wait_s: float, system_id: int | None = None) -> AsyncIterator[MavlinkVehicle]:
+async def mavlink_vehicle(url: str, wait_s: float, system_id: int | None = None) -> "AsyncIterator[MavlinkVehicle]":
     """The vehicle at a MAVLink connection, such as ``udpin://0.0.0.0:14540``; closes the connection at the end.
 
     Args:
@@ -187,12 +180,9 @@ class MavlinkVehicle:
 
         self.name, self.waits_in_mission = name, False
         self._system, self._system_id, self._ardupilot = system, system_id, ardupilot
-        self._telemetry, self._action, self._mission = (
-            TelemetryAsync(system),
-            ActionAsync(system),
-            MissionRawAsync(system),
-        )
-        self._direct, self._parameters = MavlinkDirectAsync(system), ParamAsync(system)
+        self._telemetry, self._action = TelemetryAsync(system), ActionAsync(system)
+        self._mission, self._parameters = MissionRawAsync(system), ParamAsync(system)
+        self._direct = MavlinkDirectAsync(system)
         self._position: Any = None
         self._armed: bool | None = None
         self._heard_s = -math.inf
@@ -215,8 +205,8 @@ class MavlinkVehicle:
     async def ask_for_telemetry(self, ended: asyncio.Event) -> None:
         """Ask for positions whenever none has come for a second, until the flight has ended.
 
-        With them it asks for the landed state, and once where positions come unasked but no landed state does. A denied
-        or unanswered request is no failure: what arrives shows whether it took effect.
+        With them it asks for the landed state and the battery, and once where positions come unasked but one of these
+        does not. A denied or unanswered request is no failure: what arrives shows whether it took effect.
         """
         from mavsdk.asyncio import MavsdkError
 
@@ -228,9 +218,11 @@ class MavlinkVehicle:
             if silent and not ended.is_set():
                 with suppress(MavsdkError):
                     await self._telemetry.set_rate_position(_POSITIONS_HZ)
-            if (silent or (first and not await self._telemetry.landed_state())) and not ended.is_set():
-                with suppress(MavsdkError):
-                    await self._telemetry.set_rate_landed_state(_LANDED_HZ)
+            unknown = not await self._telemetry.landed_state() or await self._battery_percent() is None
+            if (silent or (first and unknown)) and not ended.is_set():
+                for ask in (self._telemetry.set_rate_landed_state, self._telemetry.set_rate_battery):
+                    with suppress(MavsdkError):
+                        await ask(_SLOW_HZ)
             first = False
 
     async def state(self) -> VehicleState:
@@ -238,7 +230,6 @@ class MavlinkVehicle:
         fresh = time.monotonic() - self._heard_s < STALE_S
         at = self._position
         fixed = fresh and math.isfinite(at.latitude_deg) and math.isfinite(at.longitude_deg)
-        left = (await self._telemetry.battery()).remaining_percent
         landed, flown = int(await self._telemetry.landed_state()), await self._telemetry.velocity_ned()
         return VehicleState(
             connected=bool(await self._system.is_connected()),
@@ -248,9 +239,13 @@ class MavlinkVehicle:
             height_m=at.relative_altitude_m if fixed else 0.0,
             in_air=landed != _ON_GROUND if landed else None,
             speed_m_s=math.hypot(flown.north_m_s, flown.east_m_s) if fixed else None,
-            # Not a number before the first message, and for an autopilot that does not know it.
-            battery_percent=left if 0 <= left <= 100 else None,
+            battery_percent=await self._battery_percent(),
         )
+
+    async def _battery_percent(self) -> float | None:
+        # Not a number before the first message, and for an autopilot that does not know it.
+        left = float((await self._telemetry.battery()).remaining_percent)
+        return left if 0 <= left <= 100 else None
 
     async def mission(self) -> list[MissionItem]:
         """The mission on board, without ArduPilot's home."""
@@ -266,9 +261,11 @@ class MavlinkVehicle:
 
         With ``MIS_RESTART`` 1 an ArduPilot begins its mission again after mode hold, so it is not sent there.
         """
+        # Until it denies it: its answer may be lost.
+        self.waits_in_mission = self._ardupilot
         if self._ardupilot and await self._pause(True):
-            self.waits_in_mission = True
             return
+        self.waits_in_mission = False
         if self._ardupilot and await self._command("say MIS_RESTART", self._parameters.get_param_int("MIS_RESTART")):
             raise VehicleError(f"{self.name} did not hold: its MIS_RESTART begins the mission again; set it to 0")
         await self._command("hold", self._mission.pause_mission())
@@ -292,6 +289,7 @@ class MavlinkVehicle:
         what = "hold" if pauses else "go on with its mission"
         answer = json.loads((await self._command(what, self._direct.send_command(message))).fields_json)["result"]
         if answer not in (0, _UNSUPPORTED):
+            self.waits_in_mission = not pauses
             raise VehicleError(f"{self.name} did not {what}: MAV_RESULT {answer}")
         return bool(answer == 0)
 
@@ -301,8 +299,9 @@ class MavlinkVehicle:
         try:
             return await doing
         except MavsdkError as error:
-            result = getattr(error, "result", None)
-            raise VehicleError(f"{self.name} did not {what}: {getattr(result, 'name', error)}") from None
+            result = getattr(getattr(error, "result", None), "name", str(error))
+            kind = Unanswered if result == "TIMEOUT" else VehicleError
+            raise kind(f"{self.name} did not {what}: {result}") from None
 
 
 def _mode(number: int) -> FlightMode:
@@ -318,9 +317,10 @@ def _item(item: Any) -> MissionItem:
         number=item.seq,
         command=item.command,
         position=(item.y * _DEGREES, item.x * _DEGREES) if placed else None,
-        altitude_m=item.z if item.frame in _RELATIVE_FRAMES else None,
+        altitude_m=item.z if item.frame in _RELATIVE_FRAMES and math.isfinite(item.z) else None,
         parameters=(item.param1, item.param2),
         frame=item.frame,
+        autocontinue=bool(item.autocontinue),
     )
 
 

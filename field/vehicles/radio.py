@@ -58,11 +58,9 @@ class Radio(Protocol):
 
     async def beacons(self, spot: Spot) -> Mapping[int, Beacon]:
         """The newest beacon of each sensor in range; called once a UAV and step."""
-        ...
 
     async def collect(self, spot: Spot, sensor: int) -> Collected:
         """Fetch a sensor's waiting packets, as many as the link carries in one step; called at the step's end."""
-        ...
 
 
 class SimulatedRadio:

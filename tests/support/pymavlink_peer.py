@@ -47,6 +47,7 @@ class PymavlinkPeer:
         autopilot: of its heartbeats, a MAV_AUTOPILOT.
         restarts: MIS_RESTART, with which mode AUTO begins the mission again (row 5).
         enforces_ids: of MAV_OPTIONS, whether it obeys its own system ID and a ground station's alone (row 7).
+        answers_pauses: whether its answer to MAV_CMD_DO_PAUSE_CONTINUE arrives; it obeys all the same.
         pauses: whether it knows MAV_CMD_DO_PAUSE_CONTINUE, as ArduCopter does and ArduPlane and PX4 do not.
         above_home_m: its heights are above a home that is so much lower than its take-off place (row 9).
     """
@@ -59,7 +60,7 @@ class PymavlinkPeer:
         self.silent = threading.Event()
         self.autopilot = autopilot
         self.streams = set() if autopilot == ARDUPILOT else {POSITION, LANDED}
-        self.obeys_requests = self.answers_requests = self.says_landed = True
+        self.obeys_requests = self.answers_requests = self.says_landed = self.answers_pauses = True
         self.restarts, self.enforces_ids, self.pauses = 0, False, autopilot == ARDUPILOT
         self.above_home_m = 0.0
         self._items = items if autopilot != ARDUPILOT else with_home(items)
@@ -155,7 +156,9 @@ class PymavlinkPeer:
             if self.answers_requests:
                 self._link.mav.command_ack_send(message.command, mavlink.MAV_RESULT_ACCEPTED, 0, 0, *sender)
         elif kind == "COMMAND_LONG":
-            self._link.mav.command_ack_send(message.command, self._obey(message), 0, 0, *sender)
+            result = self._obey(message)
+            if message.command != PAUSE or self.answers_pauses:
+                self._link.mav.command_ack_send(message.command, result, 0, 0, *sender)
             self._heartbeat()
         elif kind == "MISSION_REQUEST_LIST" and message.mission_type == 0:
             self._link.mav.mission_count_send(*sender, len(self._items), 0)

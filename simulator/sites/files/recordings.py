@@ -1,7 +1,5 @@
 """``arrivals.csv``: the packets that arrived at each sensor in each step; ``gains.csv``: measured excess losses."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
@@ -98,7 +96,7 @@ def _packets(at: str, cell: str, sensor: str) -> int:
     return packets
 
 
-def read_gains(path: Path, sensors: Sequence[str], lengths_m: Sequence[float]) -> GainTrace:
+def read_gains(path: Path, sensors: Sequence[str], lengths_m: Sequence[float]) -> "GainTrace":
     """The gain trace of a CSV file with the header ``uav,sensor,progress_m,excess_db``, one line a point, in any order.
 
     Args:

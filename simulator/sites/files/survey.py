@@ -249,7 +249,7 @@ def _check_crs(where: str, raw: object) -> None:
         return
     properties = crs.get("properties") if isinstance(crs, dict) else None
     name = properties.get("name", properties.get("href")) if isinstance(properties, dict) else crs
-    if isinstance(properties, dict) and isinstance(code := properties.get("code"), int):
+    if isinstance(properties, dict) and isinstance(code := properties.get("code"), int | str):
         name = f"EPSG:{code}"
     if not isinstance(name, str) or not _is_wgs84(name):
         raise UsageError(f"{where}: crs is {quoted(name)}; export the file as WGS 84 (EPSG:4326)")

@@ -35,6 +35,7 @@ class MissionItem:
         parameters: the first two of the command.
         frame: a MAV_FRAME.
         height_m: above what the frame says.
+        autocontinue: whether the vehicle goes on by itself after it.
     """
 
     where: str
@@ -45,6 +46,7 @@ class MissionItem:
     parameters: tuple[float, float] = (0.0, 0.0)
     frame: int = 3
     height_m: float | None = None
+    autocontinue: bool = True
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,7 @@ def path_of(items: Sequence[MissionItem]) -> MissionPath:
             if not waypoints or waypoints[-1] != position:
                 waypoints.append(position)
                 altitudes.append(item.altitude_m)
-        elif item.command not in _HARMLESS | _STARTS | _STAYS:
+        elif item.command not in _HARMLESS | _STAYS and (waypoints or item.command not in _STARTS):
             fault = "is no straight leg" if item.command <= _LAST_NAVIGATION else "may change the path"
             raise ValueError(
                 f"{item.where}: command {item.command} {fault}; use waypoints (16), with take-off before them, and "

@@ -110,12 +110,16 @@ def test_the_payloads_battery_counts_before_the_networks(fields: dict[str, Any],
     assert waiting(pending)[0].battery == battery_j
 
 
-@pytest.mark.parametrize("changes", [{"batteryLevelUnavailable": True}, {"externalPowerSource": True}])
-def test_a_battery_that_the_device_does_not_know_says_nothing(changes: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("changes", "battery_j"), [({"batteryLevelUnavailable": True}, None), ({"externalPowerSource": True}, 50.0)]
+)
+def test_a_battery_that_the_device_does_not_know_says_nothing_and_the_mains_is_full(
+    changes: dict[str, Any], battery_j: float | None
+) -> None:
     pending = reading_buffer()
     assert take(pending, chirpstack_status(**changes)) == "battery"
     assert take(pending, chirpstack_up(f_cnt=2)) == "accepted"
-    assert waiting(pending)[0].battery is None
+    assert waiting(pending)[0].battery == battery_j
 
 
 def test_a_message_that_is_delivered_again_is_a_duplicate() -> None:
@@ -292,7 +296,6 @@ LATER: dict[str, Any] = {"at": NOW + timedelta(seconds=10), "f_cnt": 2}
 @pytest.mark.parametrize(
     "changes",
     [
-        {"externalPowerSource": True, "batteryLevel": 0},
         {"batteryLevelUnavailable": True, "batteryLevel": 0},
         {"batteryLevel": None},
         {"batteryLevel": 255},
@@ -306,6 +309,16 @@ def test_a_battery_that_chirpstack_no_longer_knows_is_unknown(changes: dict[str,
     assert take(pending, chirpstack_status(at=NOW + timedelta(seconds=5), **changes), 6) == "battery"
     assert take(pending, chirpstack_up(**LATER), 11) == "accepted"
     assert [reading.battery for reading in waiting(pending)] == [None]
+
+
+def test_a_sensor_that_was_flat_and_is_on_external_power_is_flat_no_longer() -> None:
+    """The edge keeps the battery that it knew where it gets none."""
+    pending = reading_buffer()
+    assert take(pending, chirpstack_status(batteryLevel=0.0)) == "battery"
+    again = chirpstack_status(at=NOW + timedelta(seconds=5), externalPowerSource=True, batteryLevel=0)
+    assert take(pending, again, 6) == "battery"
+    assert take(pending, chirpstack_up(**LATER), 11) == "accepted"
+    assert [reading.battery for reading in waiting(pending)] == [50.0]
 
 
 def test_a_status_with_nothing_but_its_margin_is_an_unknown_battery() -> None:
