@@ -195,7 +195,8 @@ async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: The
     Only confirmed orders are obeyed. They are added, unless they replace all; the status shows what either would end.
     """
     mission = await engine.missions.get(mission_id)
-    engine.missions.refuse_if_failing("answer")
+    if body.answer != "withdraw":
+        engine.missions.refuse_if_failing("answer")
     mission.answer_guidance(body)
     engine.compiler.compile(mission)
     engine.live.changed(mission_id)

@@ -157,6 +157,7 @@ class Engine:
         mission = await self.missions.get(mission_id)
         self.missions.refuse_if_failing("readings")
         results = mission.read(request.readings)
+        self.live.changed(mission_id)
         self._metrics.record_readings(results)
         try:
             # A duplicate's first sending may be on no disk yet.

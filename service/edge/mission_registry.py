@@ -234,7 +234,7 @@ class MissionRegistry:
         if len(self._missions) + len(self._listed) >= self._settings.max_missions:
             limit = self._settings.max_missions
             raise Conflict(
-                "mission_id", f"there are already {limit} missions: DELETE one, or raise AICVDS_MAX_MISSIONS"
+                "mission_id", f"the edge has {limit} missions of all keys: DELETE one, or raise AICVDS_MAX_MISSIONS"
             )
 
     def _count(self) -> None:

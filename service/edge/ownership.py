@@ -183,6 +183,7 @@ class LeasedOwnership:
         if failure != self._failure:
             log.error("the leases cannot be renewed, decisions end with their terms: %s", failure)
         self._failure = failure
+        self._metrics.store_failures.inc()
 
 
 def _misdirected(mission_id: str, owner: LeaseHolder) -> Misdirected:

@@ -13,7 +13,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from typing import Protocol
 
 from service.guidance.lettered_orders import PARTLY, STATIC, NoteReading, grammar, meaning
@@ -110,21 +110,18 @@ class NoteOwner(Protocol):
 
     def in_ids(self, note: str) -> tuple[str, list[str]]:
         """The note with sensors' IDs for the user's names, and doubts."""
-        ...
 
     def propose_guidance(
         self, guidance: Guidance, model: str | None, doubts: Sequence[str] = (), withdrawn: Sequence[str] = ()
     ) -> None:
         """Propose the guidance that was read in the note."""
-        ...
 
     def fail_guidance(self, reason: str, model: str | None) -> None:
         """Record that the note was not compiled."""
-        ...
 
 
 class NoteCompiler:
-    """Compiles the notes of a service's missions, one at a time.
+    """Compiles the notes of a service's missions; of those that need the LLM one at a time.
 
     Args:
         on_change: called with the mission's ID when its note was compiled, or could not be.
@@ -165,12 +162,13 @@ class NoteCompiler:
             # Compiling the phrases for a first note takes some 40 ms.
             phrased = await asyncio.to_thread(PhrasedNote, text, mission.scenario, mission.guidance.confirmed.values)
             unclear += phrased.unsaid
-            async with asyncio.timeout(TIMEOUT_S), self._lock:
+            async with asyncio.timeout(TIMEOUT_S):
                 if not phrased.is_read:
-                    await self._wait_for_llm()
-                if not _waits_for(mission, note):
-                    return
-                compiled = await compile_note(phrased, mission.scenario, self._llm)
+                    await self._wait_for_llm(mission, note)
+                async with nullcontext() if phrased.is_read else self._lock:
+                    if not _waits_for(mission, note):
+                        return
+                    compiled = await compile_note(phrased, mission.scenario, self._llm)
             if _waits_for(mission, note):
                 model = None if phrased.is_read else self._llm.notes_model
                 mission.propose_guidance(compiled.guidance, model, (*unclear, *compiled.doubts), phrased.withdrawn)
@@ -187,9 +185,9 @@ class NoteCompiler:
             mission.fail_guidance(" ".join((*unclear, f"{reason}; give `guidance` of your own")), self._llm.notes_model)
             self._on_change(mission.mission_id)
 
-    async def _wait_for_llm(self) -> None:
-        """Wait while the LLM loads or recovers; raises ``NoDecision`` if it does neither and is not ready."""
-        while self._llm.status != "ready" and self._llm.recovering:
+    async def _wait_for_llm(self, mission: NoteOwner, note: str) -> None:
+        """Wait while the note does and the LLM loads or recovers; raises ``NoDecision`` if it is not ready then."""
+        while self._llm.status != "ready" and self._llm.recovering and _waits_for(mission, note):
             await asyncio.sleep(_POLL_S)
         if self._llm.status != "ready":
             raise NoDecision("llm_unavailable", f"the LLM is {self._llm.status}")

@@ -4,8 +4,6 @@
 cannot invent a number; only code reads values and units. ``note_numbers.toml`` has their words.
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Mapping
@@ -56,7 +54,7 @@ class LetteredNote:
     numbers: Mapping[str, Number]
 
     @classmethod
-    def of(cls, note: str, seed: int) -> LetteredNote:
+    def of(cls, note: str, seed: int) -> "LetteredNote":
         """The note with letters that the seed draws.
 
         Raises:

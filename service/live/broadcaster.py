@@ -49,7 +49,7 @@ class MissionStream:
         # The number of updates so far. A listener that missed more than `_frames` has gets a snapshot.
         self._made = 0
         self._since = history.order
-        self._located = snapshots.located_sensors(mission)
+        self._places = snapshots.drawn_places(mission)
         self._last_snapshot: tuple[tuple[int, int], bytes] | None = None
         self._changed = asyncio.Event()
         self._next_update: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -102,10 +102,10 @@ class MissionStream:
 
     def _advance(self) -> None:
         """Make the next update."""
-        located = snapshots.located_sensors(self.mission)
-        if located != self._located:
+        places = snapshots.drawn_places(self.mission)
+        if places != self._places:
             # The page draws positions from a snapshot only, so every listener gets one.
-            self._located = located
+            self._places = places
             self._frames.clear()
             self._bytes = 0
         else:

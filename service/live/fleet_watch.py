@@ -20,7 +20,7 @@ from shared.world.urgency import overflow_probability
 # Most missions watched, and most steps remembered of each.
 _MOST_MISSIONS = 1000
 _MOST_STEPS = 300
-# Seconds without a decision after which a mission has ended early, and (with three steps) its UAVs are lost.
+# Seconds without a decision after which a mission has ended early (or six steps), and its UAVs are lost (and three).
 _ENDED_S, _SILENT_S = 600.0, 30.0
 
 
@@ -30,7 +30,7 @@ class Watched:
 
     Attributes:
         full: by step, the expected number of sensors that overflowed into it, as the fleet believed at its first
-            decision of the step. Sensors of which nothing was ever heard do not count.
+            decision of the step. Sensors of which nothing was ever heard do not count. ``overflows`` sums all steps.
         silent: by sensor, the newest step in which a UAV was within its radio radius and did not hear it.
         decided_at: the monotonic time of the last decision, seconds; None before the first.
         uavs: of each UAV's newest report the monotonic time, s, and its battery, percent, and height, m, if it said so.
@@ -39,6 +39,7 @@ class Watched:
     """
 
     full: BoundedDict[int, float] = field(default_factory=lambda: BoundedDict(_MOST_STEPS))
+    overflows: float = 0.0
     silent: dict[int, int] = field(default_factory=dict)
     decided_at: float | None = None
     uavs: dict[int, tuple[float, float | None, float | None]] = field(default_factory=dict)
@@ -53,7 +54,7 @@ class Watched:
     def totals(self) -> dict[str, Any]:
         """The page's numbers: sums over the steps, the silent sensors, and the seconds since the last decision."""
         return {
-            "overflows": round(sum(self.full.values()), 1),
+            "overflows": round(self.overflows, 1),
             "silent": self.silent,
             "idle_s": None if self.decided_at is None else round(time.monotonic() - self.decided_at, 1),
         }
@@ -68,14 +69,14 @@ class FleetWatch:
     def decided(self, mission: Mission, uav: UavState, step: int) -> None:
         """Record an answered report, and the belief after it."""
         watched = self.of(mission.mission_id)
-        watched.decided_at = time.monotonic()
-        now = time.monotonic()
+        now = watched.decided_at = time.monotonic()
         watched.uavs[uav.uav_id] = now, uav.battery_percent, uav.height_m
         if step > watched.began[0]:
             watched.step_took_s = now - watched.began[1] if step == watched.began[0] + 1 else watched.step_took_s
             watched.began = step, now
         if step not in watched.full:
             watched.full[step] = round(float(_overflowed(mission.belief, step, mission.scenario).sum()), 3)
+            watched.overflows += watched.full[step]
         self._hear(watched, mission, uav, step)
 
     def of(self, mission_id: str) -> Watched:
@@ -92,7 +93,7 @@ class FleetWatch:
             watched, scenario = self._missions.get(mission.mission_id), mission.scenario
             decided_at = None if watched is None else watched.decided_at
             idle_s = _ENDED_S if decided_at is None else time.monotonic() - decided_at
-            if idle_s >= _ENDED_S or mission.belief.newest == scenario.steps - 1:
+            if idle_s >= max(_ENDED_S, 6 * scenario.step_s) or mission.belief.newest == scenario.steps - 1:
                 continue
             found = alarms(mission, mission.deadlines(), {} if watched is None else watched.batteries)
             if idle_s > max(_SILENT_S, 3 * scenario.step_s):

@@ -66,9 +66,9 @@ def update(mission: Mission, decisions: list[RecentDecision], watched: Watched, 
     )
 
 
-def located_sensors(mission: Mission) -> int:
-    """The number of sensors whose position is known; the page draws each sensor once."""
-    return int(np.isfinite(mission.belief.places[:, 0]).sum())
+def drawn_places(mission: Mission) -> bytes:
+    """The sensors' positions to 1 m, which the page draws once."""
+    return mission.belief.places.round().tobytes()
 
 
 _SHOWN = {"name", "sensors", "uavs", "steps", "area_m", "step_s", "queue_capacity", "radio_radius_m", "max_velocity"}
@@ -118,6 +118,7 @@ def _uav(mission: Mission, watched: Watched, uav: int) -> dict[str, Any]:
         goal = last.ahead(belief.trajectory(uav), belief.drift, [last.action[1] * mission.scenario.step_s])[0]
     return {
         "step": last.taught if last.taught >= 0 else last.step,
+        "position_step": last.step,
         "position": last.position,
         "next": None if goal is None else np.round(goal, 1).tolist(),
         "battery": battery,

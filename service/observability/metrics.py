@@ -98,7 +98,9 @@ class Metrics:
         self.alarms = gauge("aicvds_alarms", "UAVs and sensors of which a mission's page shows an alarm", ["kind"])
         self.missions = gauge("aicvds_missions", "Missions in memory or in the store")
         self.store_seconds = histogram("aicvds_store_seconds", "Time of a commit", buckets=_OVERHEAD_BUCKETS)
-        self.store_failures = counter("aicvds_store_failures", "Commits that failed; they are tried again")
+        self.store_failures = counter(
+            "aicvds_store_failures", "Commits and renewals of leases that failed; they are tried again"
+        )
         self.leases = gauge("aicvds_leases", "Missions that this edge owns in a shared store")
         self.leases_taken_over = counter("aicvds_leases_taken_over", "Missions of other edges or starts taken over")
         self.leases_lost = counter("aicvds_leases_lost", "Missions that another edge has taken over")

@@ -5,8 +5,6 @@ Spans go to the standard ``OTEL_EXPORTER_OTLP_ENDPOINT``; without it, or without
 generative AI. It has neither prompt nor answer.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import time
@@ -26,7 +24,7 @@ log = logging.getLogger(__name__)
 _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
 
 
-def provider_from_environment(version: str) -> TracerProvider | None:
+def provider_from_environment(version: str) -> "TracerProvider | None":
     """A provider that exports over OTLP; None without an endpoint in the environment, or without the extra."""
     if not any(os.environ.get(name) for name in _ENDPOINTS):
         return None
@@ -48,7 +46,7 @@ def provider_from_environment(version: str) -> TracerProvider | None:
 class Traces:
     """Records decisions, if there is a provider."""
 
-    def __init__(self, provider: TracerProvider | None, settings: Settings) -> None:
+    def __init__(self, provider: "TracerProvider | None", settings: Settings) -> None:
         self.provider = provider
         self._tracer = None if provider is None else provider.get_tracer("aic_vds.edge")
         self._server = _address(settings.llm_url)

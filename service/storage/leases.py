@@ -7,8 +7,6 @@ write after its successor, whatever its own clock says. A transaction that locks
 that is paused between two messages, and ends then by the store's time limits.
 """
 
-from __future__ import annotations
-
 import uuid
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -147,7 +145,7 @@ class Leases:
         with self._autocommit() as db:
             return list(db.scalars(_UNOWNED, {"owner": self._owner}))
 
-    def fence(self, db: Connection[tuple[Any, ...]], missions: Collection[tuple[str, int]]) -> None:
+    def fence(self, db: "Connection[tuple[Any, ...]]", missions: Collection[tuple[str, int]]) -> None:
         """Keep the missions' leases from being taken over until the transaction ends.
 
         An ended lease is no obstacle unless another owner has taken it. If another owner has one of them, or has had it

@@ -154,11 +154,7 @@ class Statements:
 
 
 def _conflict_fails(put: Any, key: int) -> Any:
-    """An insert that ignores a row that is there already, and fails where its bytes differ.
-
-    Args:
-        key: the number of columns of the primary key, which come first.
-    """
+    """An insert that ignores a row of the same first ``key`` columns, the primary key, and fails where bytes differ."""
     names = put.table.c.keys()
     differ = sa.or_(*(put.table.c[name] != put.excluded[name] for name in names[key:]))
     # The last column must not be null.

@@ -52,7 +52,8 @@ def identity(file: str) -> Identity:
 
 def _facts(file: str) -> Facts:
     try:
-        found = os.stat(file)
+        # A link in the file's place is another file, too: the next edge opens what it points to.
+        found = os.lstat(file)
     except OSError:
         return (), (0, 0)
     return (found.st_dev, found.st_ino, found.st_nlink), (found.st_size, found.st_mtime_ns)

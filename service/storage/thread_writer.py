@@ -1,7 +1,5 @@
 """The writer of a PostgreSQL store: a separate thread."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Callable, Sequence

@@ -25,7 +25,7 @@
   const short = (name) => (name.length > 12 ? `${name.slice(0, 11)}…` : name);
   const total = (numbers) => numbers.reduce((sum, one) => sum + one, 0);
 
-  const points = [...mission.trajectories.flat(), ...mission.pipeline, ...sensors];
+  const points = [...mission.trajectories.flat(), ...mission.pipeline, ...sensors, ...frames.flatMap(({ uavs }) => uavs.map(([, x, y]) => [x, y]))];
   const low = [0, 1].map((axis) => points.reduce((least, point) => Math.min(least, point[axis]), Infinity));
   const high = [0, 1].map((axis) => points.reduce((most, point) => Math.max(most, point[axis]), -Infinity));
   const scale = (WIDTH - 2 * MARGIN) / Math.max(high[0] - low[0], (high[1] - low[1]) / 1.2, 1);

@@ -1,6 +1,6 @@
 // What may need the operator, since when, and what to do: the store, the LLM, the deadline, UAVs, visits, and sensors.
 
-import { at, make, shown } from "./dom.js";
+import { at, make, say, shown } from "./dom.js";
 
 const SOON_STEPS = 2;
 const UNHEARD_STEPS = 10;
@@ -20,6 +20,10 @@ export function showAlarms(mission, ready) {
   const key = JSON.stringify(lines);
   if (showAlarms.key === key) return;
   showAlarms.key = key;
+  const names = found.map(({ name }) => name);
+  const come = names.filter((name) => !showAlarms.names?.includes(name));
+  showAlarms.names = names;
+  if (come.length) say(at("alarm-news"), `New alarm: ${come.join(", ")}.`);
   at("alarms").hidden = found.length === 0;
   at("alarm-list").replaceChildren(...lines.map(([name, who, rest]) => make("li", {}, make("b", {}, `${name}: `), `${who}. `, make("small", {}, rest))));
 }
@@ -31,7 +35,8 @@ function ofTheEdge(mission, ready) {
   const unstored = run(answers, (answer) => !answer.stored);
   const unasked = run(answers, (answer) => /^(llm|answer)_/.test(answer.reason ?? ""));
   const reason = ready?.detail ?? "the edge's log has the reason";
-  const storeFails = unstored.length > 0 || ready?.ready === false;
+  // A store that was slow has written them since, if it works now and no decision followed.
+  const storeFails = ready?.ready === false || (unstored.length > 0 && !mission.isSilent);
   return [
     alarm("Store fails", storeFails ? [ready?.ready === false ? reason : "decisions are not on disk"] : [], "Decisions go on, but a restart forgets them: the edge's log has the reason.", unstored),
     alarm(`LLM ${ready?.llm}`, mission.about.asks && LLM_FAULTS.includes(ready?.llm) ? [reason] : [], "Others decide for it: ask it by aicvds doctor --llm-url.", unasked),

@@ -38,7 +38,7 @@ function described(mission, id, decision) {
   if (!known) return { link: ["no report yet", "quiet"] };
   const { now, scenario } = mission;
   const age = known.heard_s === null ? null : known.heard_s + mission.age;
-  const lost = now.step - known.step > LOST_STEPS;
+  const lost = now.step - known.step > LOST_STEPS || (mission.isSilent && !mission.ended);
   const trip = decision ? measured(decision) : null;
   const link = age === null ? `step ${known.step}` : `${seconds(age)} ago${trip === null ? "" : `, ${shown(trip, 0)} ms`}`;
   const answer = decision?.answer;
@@ -46,7 +46,7 @@ function described(mission, id, decision) {
     battery: known.battery === null ? ["not reported", "quiet"] : [`${shown(known.battery, 0)}%`, known.battery < LOW_PERCENT ? "bad" : ""],
     height: known.height_m === null ? ["not reported", "quiet"] : [`${shown(known.height_m, 0)} m`, ""],
     link: mission.ended ? ["mission ended", "quiet"] : [lost ? `lost: ${link}` : link, lost ? "bad" : ""],
-    next: mission.ended ? ["–", ""] : [next(), ""],
+    next: mission.ended || lost ? ["–", ""] : [next(), ""],
     does: [answer ? `${mission.sensor(answer.sensor_id)} at ${answer.velocity} m/s` : "nothing yet", ""],
   };
 

@@ -13,8 +13,8 @@ import { clearNumbers, showNumbers } from "./numbers.js";
 import { Operator } from "./operator.js";
 
 const LISTED_EVERY_MS = 3000;
-// Without a decision for so long, the mission counts as silent.
-const SILENT_S = 30;
+// The most events that wait while the view is frozen; past these the page asks for a snapshot.
+const MOST_WAITING = 2000;
 const RETRY_MS = [1000, 2000, 4000, 8000];
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
 
@@ -24,6 +24,7 @@ let following = null;
 let stop = new AbortController();
 let drawing = false;
 let paused = false;
+let waiting = [];
 let remark = null;
 let mayCommand = false;
 let ready = null;
@@ -77,7 +78,7 @@ async function list() {
 /** Whether the page stays with its mission, although another may be newer: it flies, or an order is being written. */
 function stays(told) {
   if (mission?.id !== following || !told.missions.some((one) => one.mission_id === following)) return false;
-  const writes = at("note-input").value || document.activeElement === at("orders-input");
+  const writes = paused || at("note-input").value || document.activeElement === at("orders-input");
   return writes || (!mission.ended && mission.idleS !== null && !mission.isSilent);
 }
 
@@ -94,6 +95,10 @@ function offer(told) {
 }
 
 function nothing(told) {
+  mission = null;
+  badge();
+  showClock(null);
+  document.title = "AIC-VDS mission";
   at("empty").hidden = false;
   at("mission").hidden = true;
   connection("waiting", "Waiting for a mission");
@@ -118,7 +123,8 @@ async function follow(id) {
         trouble(null);
         connection("live", "Connected");
         if (event.name === "gone") return gone(id);
-        hear(event);
+        if (!paused) hear(event);
+        else if (waiting.length < MOST_WAITING) waiting.push(event);
       }
     } catch (error) {
       if (signal.aborted) return;
@@ -202,11 +208,11 @@ function hear({ name, data }) {
 
 /** Whether the mission flies, has ended or is silent, and whether the view is frozen. */
 function badge() {
-  const state = !mission ? null : paused ? "frozen" : mission.ended ? "ended" : mission.idleS === null ? "new" : mission.idleS > SILENT_S ? "silent" : "flying";
+  const state = !mission ? null : paused ? "frozen" : mission.ended ? "ended" : mission.idleS === null ? "new" : mission.isSilent ? "silent" : "flying";
   at("badge").hidden = state === null;
   if (state === null) return;
   const minutes = Math.floor((mission.idleS ?? 0) / 60);
-  const words = { frozen: "View frozen", ended: "Ended", new: "No decision since the edge started", flying: "Flying", silent: `No decision for ${minutes ? `${minutes} min` : `${SILENT_S} s`}` }[state];
+  const words = { frozen: "View frozen", ended: "Ended", new: "No decision since the edge started", flying: "Flying", silent: `No decision for ${minutes ? `${minutes} min` : `${Math.floor(mission.idleS)} s`}` }[state];
   set(at("badge"), { "data-state": state });
   say(at("badge"), mission.id.endsWith("-replay") ? `Replay: ${words.toLowerCase()}` : words);
 }
@@ -239,15 +245,24 @@ at("picker").addEventListener("change", ({ target }) => {
   history.replaceState(null, "", wanted ? `?mission=${encodeURIComponent(wanted)}` : location.pathname);
   remark = null;
   trouble(null);
+  freeze(false);
   if (wanted) follow(wanted);
 });
 
-at("pause").addEventListener("click", () => {
-  paused = !paused;
+at("pause").addEventListener("click", () => freeze(!paused));
+
+/** Freeze the view, or show what came since. */
+function freeze(frozen) {
+  paused = frozen;
   set(at("pause"), { "aria-pressed": paused });
   badge();
-  if (!paused) draw();
-});
+  if (paused) return;
+  const came = waiting;
+  waiting = [];
+  if (came.length < MOST_WAITING) came.forEach(hear);
+  else if (following) follow(following);
+  draw();
+}
 
 setInterval(() => {
   showClock(mission);

@@ -53,6 +53,10 @@ export class MissionMap {
   /** Move what moved. */
   update(mission) {
     const { queue, urgency, heard, visits, uavs, step } = mission.now;
+    if (Object.values(uavs).some(this.beyond)) {
+      this.begin(mission);
+      return;
+    }
     const capacity = mission.scenario.queue_capacity;
     for (const mark of this.marks.values()) {
       if (mark.kind !== "sensor") continue;
@@ -84,8 +88,15 @@ export class MissionMap {
   #fit(mission) {
     const points = [...mission.trajectories.flat(), ...mission.map.filter(({ kind }) => FENCES.includes(kind)).flatMap((one) => one.points)];
     points.push(...mission.pipeline, ...mission.places.filter((place) => place[0] !== null));
-    const low = [0, 1].map((axis) => points.reduce((least, p) => Math.min(least, p[axis]), Infinity));
-    const high = [0, 1].map((axis) => points.reduce((most, p) => Math.max(most, p[axis]), -Infinity));
+    const least = (axis) => points.reduce((low, p) => Math.min(low, p[axis]), Infinity);
+    const most = (axis) => points.reduce((high, p) => Math.max(high, p[axis]), -Infinity);
+    // A UAV off its path is within the map, unless it is so far away that all else would be too small.
+    const size = Math.max(most(0) - least(0), most(1) - least(1));
+    const around = [0, 1].map((axis) => [least(axis) - size, most(axis) + size]);
+    const within = (value, [low, high]) => Math.min(high, Math.max(low, value));
+    points.push(...Object.values(mission.now.uavs).map(({ position }) => position.map((value, axis) => within(value, around[axis]))));
+    const low = [0, 1].map(least);
+    const high = [0, 1].map(most);
     // A world along one parallel or meridian has a height or width too.
     high.forEach((most, axis) => most > low[axis] || (high[axis] = low[axis] + 1));
     const width = Math.max(200, this.svg.clientWidth);
@@ -96,6 +107,8 @@ export class MissionMap {
     const left = (width - (high[0] - low[0]) * this.scale) / 2;
     this.x = (x) => px(left + (x - low[0]) * this.scale);
     this.y = (y) => px(height - MARGIN_PX - (y - low[1]) * this.scale);
+    this.drawn = (position) => position.map((value, axis) => within(value, [low[axis], high[axis]]));
+    this.beyond = ({ position }) => position.some((value, axis) => value !== within(value, [low[axis], high[axis]]) && value === within(value, around[axis]));
     set(this.svg, { viewBox: `0 0 ${width} ${Math.round(height)}` });
     [this.width, this.height, this.left] = [width, height, MARGIN_PX];
   }
@@ -143,7 +156,8 @@ export class MissionMap {
   }
 
   #fly(mission, uavs, newest, step) {
-    for (const [id, { position, step: reported }] of Object.entries(uavs)) {
+    for (const [id, { position: believed, step: reported, position_step: of }] of Object.entries(uavs)) {
+      const position = this.drawn(believed);
       const mark = this.marks.get(`uav-${id}`) ?? this.#uav(id);
       const last = newest.get(Number(id));
       const place = `translate(${this.x(position[0])} ${this.y(position[1])})`;
@@ -162,7 +176,7 @@ export class MissionMap {
         ? { x1: this.x(position[0]), y1: this.y(position[1]), x2: this.x(sensor[0]), y2: this.y(sensor[1]), visibility: null }
         : { visibility: "hidden" });
       const told = answer ? `collects from ${mission.names?.sensors[answer.sensor_id] ?? `sensor ${answer.sensor_id}`} at ${answer.velocity} m/s, decided by ${answer.source} in ${shown(latency(last.decision))} ms` : "not told anything yet";
-      mark.text = `${this.#named("UAV", id, mission.names?.uavs[id])} at step ${reported}, ${shown(position[0], 0)} m east, ${shown(position[1], 0)} m north: ${told}`;
+      mark.text = `${this.#named("UAV", id, mission.names?.uavs[id])} at step ${reported}, ${of > reported ? `believed at step ${of} ` : ""}${shown(believed[0], 0)} m east, ${shown(believed[1], 0)} m north: ${told}`;
       set(mark.group, { "aria-label": mark.text });
     }
   }

@@ -49,3 +49,17 @@ def test_an_answer_is_one_of_three(edge: Edge) -> None:
         refused = client.post("/missions/test/guidance", json=body)
         assert refused.status_code == 422 and "one of answer, guidance and note" in refused.json()["detail"]
     assert client.post("/missions/test/guidance", json={"note": "x" * 281}).status_code == 422
+
+
+def test_a_note_that_the_llm_must_read_keeps_no_other_waiting(edge: Edge) -> None:
+    """The LLM is gone: the first note waits for it, and the operator's next words are read by code."""
+    client = edge(mode="llm", llm_url="http://127.0.0.1:9/v1")
+    waits = "Somebody should keep half an eye on sensor 4 please."
+    client.put("/missions/test", json={"mode": "value", "note": waits})
+    client.put("/missions/other", json={"mode": "value"})
+    assert client.post("/missions/other/guidance", json={"guidance": OWN}).status_code == 200
+    client.post("/missions/other/guidance", json={"note": "cancel all orders"})
+    until(lambda: client.get("/missions/other/guidance").json()["status"] == "proposed")
+    assert guidance(client, "compiling")["note"] == waits
+    client.post("/missions/test/guidance", json={"note": "visit sensor 2 every 4 steps"})
+    assert guidance(client, "proposed")["in_words"] == "Visit sensor 2 at least once in every 4 steps."

@@ -24,6 +24,39 @@ def test_a_later_listener_gets_the_ages_of_his_own_time(
     assert told["idle_s"] >= 3600.0 and told["uavs"]["0"]["heard_s"] >= 3600.0
 
 
+def test_a_sensors_own_reading_reaches_an_open_page(edge: Edge, report: Report) -> None:
+    client = edge()
+    decided(client, report())
+    with watching(client) as events:
+        assert next(events)[1]["queue"][4] != 60.0
+        readings = {"readings": [{"sensor_id": 4, "queue": 60, "step": 0}]}
+        assert client.post("/missions/test/readings", json=readings).json()["results"] == ["merged"]
+        assert next(events)[1]["queue"][4] == 60.0
+
+
+def test_a_corrected_survey_moves_the_sensor_on_open_pages(edge: Edge, report: Report) -> None:
+    client = edge()
+    decided(client, report())
+    with watching(client) as events:
+        assert next(events)[1]["places"][0] == [420.0, 380.0]
+        moved = report(step=1)
+        moved["sensors"]["x"][0] = 100.0
+        decided(client, moved)
+        name, whole = next(events)
+        assert name == "snapshot" and whole["places"][0] == [100.0, 380.0]
+
+
+def test_a_uav_that_is_late_is_shown_where_it_is_believed_to_be(edge: Edge, report: Report) -> None:
+    client = edge()
+    for step in range(3):
+        decided(client, report(step=step))
+        if step < 2:
+            decided(client, report(step=step, uav_id=1))
+    with watching(client) as events:
+        told = next(events)[1]["uavs"]
+    assert [(told[uav]["step"], told[uav]["position_step"]) for uav in "01"] == [(2, 2), (1, 2)]
+
+
 def test_a_new_visit_order_is_due_by_its_own_first_step_and_a_late_uav_shows_its_report(
     edge: Edge, report: Report
 ) -> None:

@@ -46,6 +46,12 @@ def _overwritten(path: Path, at: int = PAGE) -> None:
         file.write(b"no page" * 100)
 
 
+def _moved_and_linked(path: Path) -> None:
+    """As who runs out of space does: the next edge opens what the link points to, with another log and lock."""
+    path.rename(path.with_name("elsewhere.db"))
+    path.symlink_to("elsewhere.db")
+
+
 def _written_by_another_program(path: Path) -> None:
     with sqlite3.connect(path) as other:
         other.execute("DELETE FROM missions")
@@ -67,6 +73,7 @@ DISPLACED = "was deleted, replaced or hard-linked while the edge ran: undo that,
         (lambda path: path.unlink(), f"m.db {DISPLACED}"),
         (_replaced, f"m.db {DISPLACED}"),
         (lambda path: path.parent.rename(path.parent.with_name("elsewhere")), f"m.db {DISPLACED}"),
+        (_moved_and_linked, f"m.db {DISPLACED}"),
         (lambda path: os.link(path, path.with_name("link.db")), f"m.db {DISPLACED}"),
         # Then another edge can have the lock too.
         (lambda path: path.with_name("m.db.lock").unlink(), f"m.db.lock {DISPLACED}"),
@@ -82,6 +89,7 @@ DISPLACED = "was deleted, replaced or hard-linked while the edge ran: undo that,
         "deleted",
         "replaced",
         "folder renamed",
+        "moved, and a link in its place",
         "hard-linked",
         "lock deleted",
         "opened by another edge",
@@ -113,6 +121,20 @@ def test_a_commit_that_the_next_edge_may_not_find_is_not_stored(
         writers(os.getpid())[0].kill()
         assert not client.post("/decide", json=report(step=2)).json()["stored"]
     assert caplog.text.count(reason) == 1
+
+
+def test_orders_can_be_withdrawn_while_the_store_fails(tmp_path: Path, report: Report) -> None:
+    path = tmp_path / "m.db"
+    slow = {"guidance": {"max_velocity": 3}}
+    with running(path) as (client, _):
+        client.post("/decide", json=report())
+        assert client.post("/missions/test/guidance", json=slow).status_code == 200
+        path.unlink()
+        assert not client.post("/decide", json=report(step=1)).json()["stored"]
+        assert client.post("/missions/test/guidance", json=slow).status_code == 503
+        # It is obeyed at once; the answer says that it is not on the disk.
+        assert client.post("/missions/test/guidance", json={"answer": "withdraw"}).status_code == 503
+        assert client.get("/missions/test/guidance").json()["obeyed_in_words"] is None
 
 
 def test_a_file_that_is_put_back_is_the_store_again(tmp_path: Path, report: Report) -> None:

@@ -8,6 +8,7 @@ from service.live.alarms import alarms
 from service.live.fleet_watch import FleetWatch
 from service.mission.mission import Mission
 from shared.planning.orders import Guidance, SensorWish
+from shared.wire.schemas import MissionSpec
 from tests.support.missions import PAPER, mission, uav
 from tests.support.waiting import Clock
 
@@ -108,3 +109,14 @@ def test_a_silent_fleet_has_lost_each_uav_once_also_past_its_scenarios_last_step
     assert +watch.alarms([fleet]) == {"uav_lost": 1}
     clock.ahead_s = 3 * PAPER.step_s + 30.0
     assert +watch.alarms([fleet]) == {"uav_lost": 2}
+
+
+def test_a_fleet_of_long_steps_is_lost_before_its_mission_counts_as_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    monkeypatch.setattr("service.live.fleet_watch.time", clock)
+    slow, watch = mission(MissionSpec(scenario=PAPER.model_copy(update={"step_s": 300.0}))), FleetWatch()
+    slow.observe(uav(), 0)
+    watch.decided(slow, uav(), 0)
+    for ahead_s, lost in ((850.0, 0), (950.0, 1), (1750.0, 1), (1850.0, 0)):
+        clock.ahead_s = ahead_s
+        assert watch.alarms([slow])["uav_lost"] == lost

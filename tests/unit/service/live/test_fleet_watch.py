@@ -28,6 +28,12 @@ def test_full_queues_are_counted_once_a_step() -> None:
     assert all(seen.of("test").full[step] >= 2 for step in range(3))
 
 
+def test_overflows_are_counted_on_when_their_steps_are_forgotten() -> None:
+    seen = watch(mission(), *(uav(step=step, queue=[60.0, 60.0], last_seen=[step] * 2) for step in range(320)))
+    assert len(seen.of("test").full) == 300
+    assert seen.of("test").totals()["overflows"] >= 640
+
+
 def test_a_report_again_at_the_same_step_counts_once() -> None:
     fleet, watched = mission(), FleetWatch()
     for _ in range(3):
