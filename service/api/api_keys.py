@@ -3,8 +3,6 @@
 A key is 256 random bits, so its plain SHA-256 does not reveal it. The key itself is shown once, when it is made.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import hmac
@@ -69,7 +67,7 @@ class KeyFile(BaseModel):
     keys: list[ApiKey] = Field(default_factory=list, max_length=MOST_KEYS)
 
     @classmethod
-    def read(cls, path: Path) -> KeyFile:
+    def read(cls, path: Path) -> "KeyFile":
         """Read the file; raises ``BadKeys``."""
         try:
             return cls.model_validate_json(text_of(path, _MAX_BYTES))

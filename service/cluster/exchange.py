@@ -1,7 +1,5 @@
 """Requests and answers between the ingress and the owners of missions, and the routing of requests."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Mapping
@@ -122,7 +120,7 @@ class Exchanged:
     body: bytes
 
     @classmethod
-    async def read(cls, scope: Scope, receive: Receive) -> Exchanged:
+    async def read(cls, scope: Scope, receive: Receive) -> "Exchanged":
         """The request of an ASGI call, whose body is already bounded."""
         body = bytearray()
         while True:

@@ -42,15 +42,12 @@ class Owners(Protocol):
 
     async def ask(self, request: Exchanged, within_s: float) -> Answer:
         """The answer of the edge to which the mission's ID maps; of any edge without a mission."""
-        ...
 
     async def ask_all(self, request: Exchanged, within_s: float) -> dict[str, Answer]:
         """The answers of the edges by address; at least one."""
-        ...
 
     async def address(self, mission_id: str | None, within_s: float) -> str:
         """The URL of the edge to which the mission's ID maps."""
-        ...
 
 
 class Ingress:

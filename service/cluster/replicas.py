@@ -1,7 +1,5 @@
 """The owners of missions, ordinary edges with their own addresses, as replicas of a Ray Serve deployment."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import socket
@@ -90,7 +88,7 @@ class Owner:
             await self._serving
 
 
-def _application(settings: Settings) -> FastAPI:
+def _application(settings: Settings) -> "FastAPI":
     # The ingress imports this module too, and needs no application.
     from service.api.app import create_app
     from service.storage.store import Store

@@ -1,7 +1,5 @@
 """``aicvds doctor``: problems that may keep an edge from running here, and their remedies."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import platform
@@ -26,8 +24,6 @@ from shared.wire.schemas import LLM_MODES
 if TYPE_CHECKING:
     from service.llm.probing import Examination
 
-# A large model on a small machine reads its first prompt slowly.
-_EXAMINED_S = 120.0
 _LATE = (
     "raise AICVDS_DEADLINE_MS, use a faster model, or turn its thoughts off "
     """(AICVDS_LLM_EXTRA_BODY='{"reasoning_effort": "none"}')"""
@@ -174,15 +170,15 @@ def _llm_server(settings: Settings) -> Iterator[Finding]:
     from service.llm.probing import examine
     from service.mission.prompt_fit import warm_up
 
-    async def examined() -> Examination:
-        async with asyncio.timeout(_EXAMINED_S):
+    async def examined() -> "Examination":
+        async with asyncio.timeout(settings.llm_load_s):
             return await examine(settings, warm_up(settings))
 
     try:
         found = asyncio.run(examined())
     except TimeoutError:
         remedy = "start the server, or wait until it has loaded its model"
-        yield Finding("LLM", f"{settings.llm_url}: no answer in {_EXAMINED_S:g} s", remedy)
+        yield Finding("LLM", f"{settings.llm_url}: no answer in {settings.llm_load_s:g} s", remedy)
         return
     except NoDecision as error:
         yield Finding("LLM", str(error), _REMEDIES.get(error.reason, _REMEDIES["llm_error"]))
@@ -193,7 +189,7 @@ def _llm_server(settings: Settings) -> Iterator[Finding]:
     yield Finding("LLM", _timed(found, settings.deadline_ms), _LATE if late else None)
 
 
-def _timed(found: Examination, deadline_ms: int) -> str:
+def _timed(found: "Examination", deadline_ms: int) -> str:
     tokens = ""
     if found.prompt_tokens is not None and found.completion_tokens is not None:
         cached = f" ({found.cached_tokens} cached)" if found.cached_tokens is not None else ""

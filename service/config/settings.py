@@ -1,7 +1,5 @@
 """Every setting of the edge service; the environment variables have the prefix ``AICVDS_``."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -238,7 +236,7 @@ class Settings(BaseSettings):
         """The most experiences in a prompt of this mode, unless the mission has its own number."""
         return (30 if mode == "llm" else 8) if self.experiences is None else self.experiences
 
-    def each_server(self) -> list[Settings]:
+    def each_server(self) -> "list[Settings]":
         """Settings with a single LLM server, for each server in the order of their URLs; raises ``ValueError``."""
         if self.llm_url is None:
             return [self]
@@ -290,6 +288,8 @@ def _checked_url(url: str) -> str:
         raise ValueError("is not a valid address") from None
     if parsed.userinfo or not parsed.host:
         raise ValueError("must name a host and no user: the key goes into AICVDS_LLM_API_KEY")
+    if parsed.query or parsed.fragment or parsed.port not in (None, *range(1, 65_536)):
+        raise ValueError("must end in a path, with a port up to 65535: a query goes into AICVDS_LLM_EXTRA_QUERY")
     return url.rstrip("/")
 
 

@@ -30,11 +30,9 @@ class Preference(Protocol):
     @property
     def action(self) -> Action:
         """The adviser's preferred sensor and velocity."""
-        ...
 
     def probabilities(self, actions: Sequence[Action]) -> FloatArray:
         """The adviser's probabilities of the candidates, ``(n,)``, summing to 1."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

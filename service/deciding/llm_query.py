@@ -123,9 +123,9 @@ class LlmQueries:
         try:
             answer = check_answer(completion.text, sensor_ids, levels)
         except NoDecision as fault:
-            self._llm.record_usability(mission.mission_id, fault, completion.model)
+            self._llm.record_usability(mission.mission_id, fault, completion.url)
             raise
-        self._llm.record_usability(mission.mission_id, None, completion.model)
+        self._llm.record_usability(mission.mission_id, None, completion.url)
         return answer
 
     async def ask(self, mission: Mission, candidates: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
@@ -198,9 +198,9 @@ class LlmQueries:
             query = partial(self._llm.ask_labels, mission.mission_id, static, user, labels)
             completion = await self._limits.within(query, deadline)
             by_label = self._labels.read(completion, static, labels)
-            self._llm.record_usability(mission.mission_id, None, completion.model)
+            self._llm.record_usability(mission.mission_id, None, completion.url)
         except NoDecision as error:
-            self._llm.record_usability(mission.mission_id, error, completion.model if completion else None)
+            self._llm.record_usability(mission.mission_id, error, completion.url if completion else None)
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
             reason = error.reason
         self._metrics.llm_requests.labels(reason or "ok").inc()

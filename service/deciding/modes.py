@@ -70,11 +70,9 @@ class Mode(Protocol):
 
     def question(self, state: AttendedState, task: DecisionTask) -> Question:
         """The prompt for this state."""
-        ...
 
     async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
         """The mode's choice, or the reason for a fallback."""
-        ...
 
 
 class PolicyMode:

@@ -272,11 +272,7 @@ def _serve(flight: _Flight, sensor: int, packets: float) -> bool:
 
 @inlined
 def _arrive(world: FlownWorld, flight: _Flight, arrivals: FloatArray, step: int, future: int) -> tuple[float, float]:
-    """End the step with its arrivals.
-
-    Returns:
-        The packets lost, weighted, with the cost of overdue sensors, and those lost in the candidate's reach.
-    """
+    """End the step with its arrivals; returns the weighted loss, and the packets lost in the candidate's reach."""
     capacity, lost, in_reach = world.urgency.shape[0] - 1.0, 0.0, 0.0
     for j in range(flight.queue.shape[0]):
         filled = flight.queue[j] + arrivals[step, future, j]

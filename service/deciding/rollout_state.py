@@ -1,7 +1,5 @@
 """The rollout evaluator's initial state, a copy of the belief before a UAV's decision, and futures sampled from it."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -89,7 +87,7 @@ class RolloutState:
         reserved: Collection[int] = (),
         plans: Mapping[int, NDArray[np.int64] | Sequence[Action]] | None = None,
         guidance: Guidance = NO_GUIDANCE,
-    ) -> RolloutState:
+    ) -> "RolloutState":
         """The state before this UAV's decision at this step; ``plans`` are the fleet's from this step on."""
         # A fleet may continue past the scenario's last step.
         left = scenario.steps - step
@@ -182,7 +180,7 @@ class SampledFutures:
     fades: FloatArray
 
     @classmethod
-    def of(cls, state: RolloutState, count: int) -> SampledFutures:
+    def of(cls, state: RolloutState, count: int) -> "SampledFutures":
         """Sample futures, each with its own arrival rates, because a rarely heard sensor may fill fast."""
         scenario, shape = state.scenario, (count, len(state.sensors))
         random = np.random.default_rng(state.seed)

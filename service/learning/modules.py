@@ -10,8 +10,6 @@ v is ``u_v = w_2 relu(W_1 [z, a_v] + b_1) + b_2`` with the same weights for ever
 :meth:`State.approaches`: a scenario may have any number of levels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple, Self
@@ -90,7 +88,7 @@ class Weights:
 
     __slots__ = ("flat", "layout", "parameters")
 
-    def __init__(self, layout: Layout, flat: Array) -> None:
+    def __init__(self, layout: "Layout", flat: Array) -> None:
         self.layout, self.flat = layout, flat
         self.parameters = layout.arrays(flat)
 

@@ -16,7 +16,6 @@ import ssl
 import time
 from collections.abc import Mapping
 from email.utils import parsedate_to_datetime
-from string import ascii_letters
 from typing import Any
 
 import aiohttp
@@ -29,17 +28,27 @@ _SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 480.0
 _KEYS = re.compile(r"(bearer\s+|\b(?:sk|key|hf|gsk|nvapi|xai|pk)[-_])[^\s\"'<>]+|(?<=://)[^\s/@]+@", re.IGNORECASE)
 _TAGS = re.compile(r"<(script|style).*?</\1>|<[^>]*>", re.IGNORECASE | re.DOTALL)
 _MAX_TOKENS, _MAX_POSITIONS, _MAX_LIKELIEST = 10**9, 4096, 80
-_TAG = r"(?:think(?:ing)?|thought|reasoning)[>\]]"
+_TAG = r"(?:(?:seed:)?think(?:ing)?|thoughts?|reasoning|analysis|scratch_?pad)[>\]]"
 _THOUGHTS = re.compile(rf"\A\s*(?:[<\[]{_TAG}.*?[<\[]/{_TAG}\s*)+", re.DOTALL | re.IGNORECASE)
 _UNCLOSED = re.compile(rf"\A\s*[<\[]{_TAG}", re.IGNORECASE)
 _CLOSING = re.compile(rf"[<\[]/{_TAG}", re.IGNORECASE)
+# Thoughts between special tokens (Cohere, Open Thoughts).
+_MARKED = re.compile(r"<\|(start|begin|end)_(?:of_)?th(?:inking|ought)\|>", re.IGNORECASE)
 _FINAL = re.compile(r".*<\|channel\|>final[^<]*<\|message\|>", re.DOTALL)
-_SPECIAL = re.compile(r"(?:<[|\uff5c][^<>]{1,40}[|\uff5c]>|</s>|<end_of_turn>)\Z")
+_SPECIAL = re.compile(r"(?:<[|\uff5c][^<>]{1,40}[|\uff5c]>|</s>|<end_of_turn>|<eos>|<pad>)\Z")
 # An answer that has none of these.
 _PLAIN = re.compile(r"[a-zA-Z0-9 .,:;+-]*")
 _LONGEST_SPECIAL, _FENCE = 44, "```"
-_WRAPPED = re.compile(r"""\A\s*(?:\*\*(.*)\*\*|"(.*)"|\\boxed\{(.*)\})\s*\Z""", re.DOTALL)
-_ODD_BLANKS = str.maketrans({"\ufeff": None, "\u200b": None, "\u00a0": " "})
+_WRAPPED = re.compile(
+    r"""\A\s*(?:\*\*(.*)\*\*|\*(.*)\*|"(.*)"|`(.*)`|\\boxed\{(.*)\}|<answer>(.*)</answer>|<\|[^<>]{1,40}\|>(.*))\s*\Z""",
+    re.DOTALL,
+)
+# An answer that was cut before its end: thoughts that the prompt opens, or JSON.
+_PROSE = re.compile(r"\s*(?:[a-zA-Z]{3}|\{\s*\"[^}]*\Z)")
+# A fenced block's language.
+_LANGUAGE = re.compile(r"\A[a-zA-Z]+(?=\s*\n\s*\S|\s*[{\[\d])")
+# Kimi-VL writes its tags with triangles.
+_ODD_CHARACTERS = str.maketrans({"\ufeff": None, "\u200b": None, "\u00a0": " ", "◁": "<", "▷": ">"})
 # A blank and the end of a line in the vocabularies of GPT-2 and SentencePiece.
 _BLANKS = str.maketrans({"Ġ": " ", "▁": " ", "Ċ": "\n"})
 
@@ -136,7 +145,11 @@ def completion_of(answer: Any, base_url: str, secrets: tuple[str, ...] = ()) -> 
     cut = choice.get("finish_reason") == "length"
     text = _text(content)
     if not text and not failed and not cut:
-        text = _arguments(message.get("tool_calls")) or _text(reasoning) or text
+        text = (
+            _arguments(message.get("tool_calls") or [{"function": message.get("function_call")}])
+            or _text(reasoning)
+            or text
+        )
     if text is None and (reasoning or cut):
         text = ""
     if text is None or (failed and not text):
@@ -148,13 +161,14 @@ def completion_of(answer: Any, base_url: str, secrets: tuple[str, ...] = ()) -> 
         # vLLM's logprobs have the thoughts' tokens too, where it gives the thoughts apart.
         positions = _after_thoughts(positions) or (positions if plain == text else ())
     prompt, cached, completion = _counts(answer.get("usage"))
-    unfinished = cut and not plain.strip() and (not text or bool(reasoning) or plain != text)
-    return Completion(plain, prompt, cached, completion, positions, unfinished=unfinished)
+    unfinished = cut and (_PROSE.match(plain) if plain.strip() else not text or reasoning or plain != text)
+    return Completion(plain, prompt, cached, completion, positions, unfinished=bool(unfinished))
 
 
 def _text(content: Any) -> str | None:
     if isinstance(content, list):
-        parts = [part.get("text") for part in content if isinstance(part, dict) and part.get("type") == "text"]
+        known = [part if isinstance(part, dict) else {"text": part} for part in content]
+        parts = [part.get("text") for part in known if part.get("type", "text") in ("text", "output_text")]
         return "".join(part for part in parts if isinstance(part, str))
     if isinstance(content, dict):
         return json.dumps(content)
@@ -198,7 +212,8 @@ def _without_thoughts(text: str) -> str:
     """A text without thoughts, special tokens and marks around its answer; empty if the thoughts have no end."""
     if _PLAIN.fullmatch(text):
         return text
-    text = _without_specials(text.translate(_ODD_BLANKS))
+    text = _without_specials(text.translate(_ODD_CHARACTERS))
+    text = _MARKED.sub(lambda mark: "</think>" if mark[1].lower() == "end" else "<think>", text)
     if "<|message|>" in text:
         final = _FINAL.match(text)
         text = text[final.end() :] if final else ""
@@ -216,7 +231,7 @@ def _without_fence(text: str) -> str:
     block = text.strip()
     if len(block) < 2 * len(_FENCE) or not (block.startswith(_FENCE) and block.endswith(_FENCE)):
         return text
-    return block[len(_FENCE) : -len(_FENCE)].lstrip(ascii_letters).strip()
+    return _LANGUAGE.sub("", block[len(_FENCE) : -len(_FENCE)]).strip()
 
 
 def _without_specials(text: str) -> str:

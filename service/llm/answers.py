@@ -1,7 +1,5 @@
 """An LLM server's answer: its text and token probabilities, the checks that it must pass, and its failures."""
 
-from __future__ import annotations
-
 import json
 import re
 import time
@@ -63,7 +61,7 @@ class TokenPosition:
     token: str
     likeliest: dict[str, float]
 
-    def untempered(self, temperature: float) -> TokenPosition:
+    def untempered(self, temperature: float) -> "TokenPosition":
         """The same with the probabilities at temperature 1: ``q^T``, renormalised."""
         return TokenPosition(self.token, raised(self.likeliest, temperature))
 
@@ -83,6 +81,7 @@ class Completion:
         prompt_tokens: of the server's ``usage``, as ``cached_tokens`` and ``completion_tokens``; None if missing.
         positions: of the text's tokens; empty if the server gives no probabilities.
         model: name of the model that answered.
+        url: of the server that answered; None for the embedded LLM.
         unfinished: whether the server stopped at its limit of tokens before the answer began.
     """
 
@@ -92,6 +91,7 @@ class Completion:
     completion_tokens: int | None
     positions: tuple[TokenPosition, ...] = ()
     model: str | None = None
+    url: str | None = None
     unfinished: bool = False
 
 

@@ -66,7 +66,7 @@ class LLMClient:
         extras: the operator's own fields, headers and query of each request.
 
     Raises:
-        NoDecision: the environment names a proxy that cannot be used.
+        NoDecision: the environment names a proxy or certificates that cannot be used.
     """
 
     def __init__(
@@ -97,7 +97,10 @@ class LLMClient:
             secret for secret in (api_key, *self._extras.headers.values(), *self._extras.query.values()) if secret
         )
         # The edge bounds its calls, so the connector need not; the certificates are those that httpx trusts.
-        connector = _BoundedConnector(limit=0, ssl=httpx.create_ssl_context(trust_env=trust_env))
+        try:
+            connector = _BoundedConnector(limit=0, ssl=httpx.create_ssl_context(trust_env=trust_env))
+        except OSError as error:
+            raise NoDecision("llm_error", f"SSL_CERT_FILE or SSL_CERT_DIR: {error}") from error
         self._http = aiohttp.ClientSession(
             headers=headers,
             connector=connector,
@@ -145,15 +148,18 @@ class LLMClient:
         terms = known = self._terms
         while True:
             sent = terms.applied(body)
-            # Each token may come with the likeliest tokens of its position.
-            most = max(_MAX_RESPONSE_BYTES, _BYTES_A_TOKEN * sent[terms.max_tokens])
             if self._extras.body:
                 sent = {**sent, **self._extras.body}
+            # Each token may come with the likeliest tokens of its position.
+            tokens = sent[terms.max_tokens]
+            most = max(_MAX_RESPONSE_BYTES, _BYTES_A_TOKEN * (tokens if isinstance(tokens, int) else 0))
             try:
                 found = await self._call("POST", self._completions, sent, most, session)
                 answer = completion_of(found, self.base_url, self._secrets)
-            except NotUnderstood as refused:
-                other = terms.after_refusal(str(refused), sent)
+            except NoDecision as refused:
+                # Some servers refuse a field by 500, as a template that raises.
+                by_status = refused.reason == "llm_status" and not isinstance(refused, Busy)
+                other = terms.after_refusal(str(refused), sent) if by_status else None
                 if other is None:
                     raise
             else:
@@ -181,19 +187,17 @@ class LLMClient:
         headers = {}
         if session is not None and self._session_header is not None:
             headers = {self._session_header: session}
-        exchange = _Exchange(most)
-        try:
-            status, head, content = await self._exchange(method, url, sent, headers, exchange)
-        except (aiohttp.ServerDisconnectedError, ConnectionResetError, aiohttp.ClientOSError) as error:
-            if not exchange.reused or exchange.answered or isinstance(error, aiohttp.ClientConnectorError):
-                raise self._failure(error) from error
-            # The server closed an idle connection as the request was sent (aiohttp 9138): it has not seen the request.
+        while True:
+            exchange = _Exchange(most)
             try:
-                status, head, content = await self._exchange(method, url, sent, headers, _Exchange(most))
-            except (aiohttp.ClientError, OSError, ValueError) as again:
-                raise self._failure(again) from again
-        except (aiohttp.ClientError, OSError, ValueError) as error:
-            raise self._failure(error) from error
+                status, head, content = await self._exchange(method, url, sent, headers, exchange)
+                break
+            except (aiohttp.ServerDisconnectedError, ConnectionResetError, aiohttp.ClientOSError) as error:
+                # Any idle connection may have been closed as the request was sent (aiohttp 9138): nobody saw it.
+                if not exchange.reused or exchange.answered or isinstance(error, aiohttp.ClientConnectorError):
+                    raise self._failure(error) from error
+            except (aiohttp.ClientError, OSError, ValueError) as error:
+                raise self._failure(error) from error
         if not 200 <= status < 300:
             kind = NotUnderstood if status in _NOT_UNDERSTOOD else NoDecision
             target = head.get("Location", "").split("?")[0] if status in _REDIRECTS else ""

@@ -52,10 +52,6 @@ class Connection:
         terms = "" if self.client is None else str(self.client.terms)
         return f"{self.abilities}; with {terms}" if terms else str(self.abilities)
 
-    def is_named(self, model: str) -> bool:
-        """Whether answers of this server name the model so."""
-        return model in (self.model, self.bare_model)
-
     @property
     def embedded(self) -> bool:
         """Whether the LLM is the embedded one, once it is loaded."""
@@ -100,12 +96,12 @@ class Connection:
 
     async def ping(self) -> None:
         """Send a short request; raises :class:`NoDecision` or ``TimeoutError``."""
-        async with asyncio.timeout(PROBE_TIMEOUT_S):
+        async with asyncio.timeout(self._settings.llm_load_s):
             await self._reached().complete(probe_body(self.model, self.abilities.constraint))
 
     async def probe_again(self) -> None:
         """Probe the abilities and a decision; raises :class:`NoDecision` or ``TimeoutError``."""
-        async with asyncio.timeout(PROBE_TIMEOUT_S):
+        async with asyncio.timeout(self._settings.llm_load_s):
             await self._find_abilities()
         await self._judge()
 
@@ -128,7 +124,7 @@ class Connection:
         """The answer to a decision's request; raises :class:`NoDecision`."""
         client, embedded = self._reached(), self._embedded
         if embedded is None:
-            return replace(await client.complete(body, mission_id), model=self.model)
+            return replace(await client.complete(body, mission_id), model=self.model, url=self._settings.llm_url)
         with embedded.request(body["messages"][0]["content"], self._warm_up.static) as fields:
             answer = await client.complete(body | fields)
         return replace(answer, model=self.bare_model if "lora" in fields else self.model)

@@ -1,7 +1,5 @@
 """The embedded LLM's weights: one file, downloaded and checked, then written in 8 bits."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 import subprocess
@@ -143,7 +141,7 @@ def to_eight_bits(source: Path, target: Path) -> None:
     writer.close()
 
 
-def _copy_keys(reader: GGUFReader, writer: GGUFWriter) -> None:
+def _copy_keys(reader: "GGUFReader", writer: "GGUFWriter") -> None:
     for name, field in reader.fields.items():
         if name not in _WRITTEN_BY_ITSELF:
             kind, *inner = field.types

@@ -94,6 +94,10 @@ async def _constraint(client: LLMClient, model: str | None) -> Constraint:
                 text = (await client.complete(probe_body(model, constraint))).text
             except Unreachable:
                 raise
+            except Busy as busy:
+                perhaps_busy = True
+                await asyncio.sleep(busy.pause_s)
+                continue
             except NoDecision as failed:
                 perhaps_busy = perhaps_busy or not isinstance(failed, NotUnderstood)
                 continue
@@ -152,11 +156,7 @@ async def _answer(client: LLMClient, body: dict[str, Any]) -> Completion | None:
 
 
 async def _listed_model(client: LLMClient) -> str | None:
-    """The first listed model that may chat, else the first; None, and the server's own default, without a list.
-
-    Raises:
-        Unreachable: the server is gone.
-    """
+    """The first listed model that may chat, else the first; None without a list. Raises :class:`Unreachable`."""
     try:
         names = await client.models()
         return next((name for name in names if not _NO_CHAT.search(name)), names[0] if names else None)

@@ -1,7 +1,5 @@
 """The request bodies of chat completions, with the fields that constrain a server to the form of the answer."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -246,13 +244,14 @@ class RequestTerms:
             changed["messages"] = _folded(changed["messages"])
         return changed
 
-    def after_refusal(self, message: str, body: dict[str, Any]) -> RequestTerms | None:
+    def after_refusal(self, message: str, body: dict[str, Any]) -> "RequestTerms | None":
         """These terms with the refused field renamed, lowered or dropped; None if the message names no such field.
 
         Args:
             message: the server's own words, with the parameter that it names.
             body: the request body to which these terms were applied.
         """
+        message = message.lower()
         if _ABOUT_LENGTH.search(message):
             return None
         if _TOO_FEW.search(message) and not self.more_tokens:
@@ -284,7 +283,7 @@ class RequestTerms:
         ]
         return ", ".join(text for changed, text in changes if changed)
 
-    def with_more_tokens(self, most: int) -> RequestTerms | None:
+    def with_more_tokens(self, most: int) -> "RequestTerms | None":
         """These terms with the next larger number of tokens for thought; None if that would be more than ``most``."""
         more = next((budget for budget in (*_BUDGETS, most) if self.more_tokens < budget <= most), None)
         return None if more is None else replace(self, more_tokens=more)

@@ -1,7 +1,5 @@
 """One LLM server: its life cycle, its health, and the calls that the edge makes to it."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math
@@ -277,6 +275,11 @@ class LlmServer:
             await asyncio.sleep(self._breaker.pause_s)
             try:
                 await self.connection.ping()
+            except NotUnderstood as error:
+                # It may have another model now.
+                self.status = ServerStatus("unavailable", str(error))
+                self.start()
+                return
             except Exception as error:
                 self._breaker.failed()
                 log.warning("LLM still fails, next try in %g s: %s", self._breaker.pause_s, error)

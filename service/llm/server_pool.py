@@ -99,11 +99,9 @@ class ServerPool:
         others = sum(server.status.llm == "ready" for server in self._each if server is not active)
         return active.readiness().model_copy(update={"standing_by": others})
 
-    def record_usability(self, mission_id: str, fault: NoDecision | None, model: str | None = None) -> None:
-        """Record whether the answer of a ``model`` could be used; ``fault`` is the reason why not."""
-        server = self.serving(mission_id)
-        if model and not server.connection.is_named(model):
-            server = next((one for one in self._each if one.connection.is_named(model)), server)
+    def record_usability(self, mission_id: str, fault: NoDecision | None, url: str | None = None) -> None:
+        """Record whether the answer of the server ``url`` could be used; ``fault`` is the reason why not."""
+        server = next((one for one in self._each if url and one.url == url), self.serving(mission_id))
         if fault is None:
             server.usability.usable()
         elif fault.reason in LLM_FAILURES and fault.reason != "llm_timeout":

@@ -1,7 +1,5 @@
 """A fleet's decisions: their reservations, pending outcomes and applied outcomes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -38,7 +36,7 @@ class Pending(NamedTuple):
     sample: Sample | None
 
     @classmethod
-    def of(cls, state: Mapping[str, Any]) -> Pending:
+    def of(cls, state: Mapping[str, Any]) -> "Pending":
         """From its fields by name, the sample's in their order."""
         sample = None if state["sample"] is None else Sample(*state["sample"])
         return cls(**{**state, "sample": sample})

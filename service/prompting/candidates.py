@@ -6,8 +6,6 @@ and positions, stay the same for a mission's life. In a prompt about several UAV
 letters begin with A. These rows name the sensor, because two UAVs may not share one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -81,7 +79,6 @@ class RowsWriter(Protocol):
             letters: each row's first choice letter.
             options: each row's velocity options, slowest first.
         """
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +109,7 @@ class CandidateSet:
                 labels[letter] = actions.setdefault(Action(int(state.ids[row]), velocity), len(actions))
         return cls(list(actions), labels, write(rows, letters.first[: len(rows)], options))
 
-    def with_actions(self, added: Sequence[Action]) -> CandidateSet:
+    def with_actions(self, added: Sequence[Action]) -> "CandidateSet":
         """The set with more actions, which have no letter."""
         return CandidateSet(list(dict.fromkeys([*self.actions, *added])), self.labels, self.rows)
 

@@ -3,8 +3,6 @@
 Both have the calls of :class:`shared.client.calls.Calls`, with the same arguments and results.
 """
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Callable, Coroutine
@@ -59,11 +57,11 @@ class AsyncEdgeClient(Calls):
 
 def _blocking(
     call: Callable[Concatenate[Calls, P], Coroutine[Any, Any, Result]],
-) -> Callable[Concatenate[EdgeClient, P], Result]:
+) -> "Callable[Concatenate[EdgeClient, P], Result]":
     """The call as a method of the blocking client."""
 
     @wraps(call)
-    def method(client: EdgeClient, /, *args: P.args, **kwargs: P.kwargs) -> Result:
+    def method(client: "EdgeClient", /, *args: P.args, **kwargs: P.kwargs) -> Result:
         # It never suspends, so that its first step is its last.
         try:
             call(client._calls, *args, **kwargs).send(None)

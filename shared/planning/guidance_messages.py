@@ -1,7 +1,5 @@
 """The wire of the operator's guidance: a mission's guidance with its orders, and the operator's answers."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator

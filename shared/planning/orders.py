@@ -4,8 +4,6 @@ An operator writes a note in plain words, and an LLM compiles it to a :class:`Gu
 guidance. Empty guidance changes no number anywhere.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Collection, Iterable, Mapping
 from typing import Annotated, Self
@@ -251,7 +249,7 @@ class Guidance(Received):
         late = [steps - np.clip(due, 0, steps) for steps in (*ways.tolist(), counted)]
         return np.asarray(LATE_PACKETS * (np.array(late[:-1]) - late[-1]))
 
-    def merged_with(self, in_force: Guidance, levels: int) -> Guidance:
+    def merged_with(self, in_force: "Guidance", levels: int) -> "Guidance":
         """These orders merged with the orders in force.
 
         For a sensor in both, these orders apply. The allowed velocities are those of 0..levels - 1 m/s that both allow;
@@ -270,7 +268,7 @@ class Guidance(Received):
         """These orders without those of some names."""
         return self.of({name: value for name, value in self.values.items() if name not in names}, self.ends)
 
-    def added_to(self, in_force: Guidance, levels: int) -> Guidance:
+    def added_to(self, in_force: "Guidance", levels: int) -> "Guidance":
         """The orders in force and these: where two contradict each other, this guidance's.
 
         An order contradicts one of the same name, a visit that its sensor is ignored, and velocities each other if they
@@ -298,7 +296,7 @@ class Guidance(Received):
         """The orders in plain English, from the structure alone."""
         return " ".join(self.each_in_words().values()) or "Nothing beyond the mission's own rules."
 
-    def beyond(self, other: Guidance) -> list[str]:
+    def beyond(self, other: "Guidance") -> list[str]:
         """The orders, each in words, that the other guidance does not have."""
         others = set(other.each_in_words().values())
         return [order for order in self.each_in_words().values() if order not in others]

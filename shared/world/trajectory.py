@@ -25,15 +25,12 @@ class Trajectory(Protocol):
     @property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """The lowest and the highest x and y, each ``(2,)``, metres."""
-        ...
 
     def at(self, progress_m: ArrayLike) -> FloatArray:
         """The points at arc lengths ``(...)`` from the trajectory's beginning, ``(..., 2)``, metres."""
-        ...
 
     def locate(self, position: Point) -> tuple[float, float]:
         """The arc length of the trajectory's point nearest to a position, and the gap between the two, metres."""
-        ...
 
 
 class Circle:

@@ -1,7 +1,5 @@
 """Plans of a fleet with the fewest lost packets over a horizon, found and bounded by CP-SAT."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterator, Mapping
@@ -87,7 +85,7 @@ class Interrupted(KeyboardInterrupt):
         self.plan = plan
 
 
-def plan(problem: FleetProblem, budget: Budget, links: Links = "exact", hint: IntArray | None = None) -> Plan:
+def plan(problem: FleetProblem, budget: Budget, links: "Links" = "exact", hint: IntArray | None = None) -> Plan:
     """Search once.
 
     Args:
@@ -200,7 +198,7 @@ def _receding(problem: FleetProblem, seconds: float) -> IntArray:
         )
 
 
-def _better(best: Plan, found: Plan, links: Links) -> Plan:
+def _better(best: Plan, found: Plan, links: "Links") -> Plan:
     """The better plan, with the higher of the bounds that hold in the world."""
     proven = 0 if links == "cautious" else found.lower_bound
     return replace(min(best, found, key=_lost), lower_bound=max(best.lower_bound, proven))
@@ -224,7 +222,7 @@ def _lost(plan: Plan) -> int:
     return plan.lost_packets
 
 
-def _search(formulation: Formulation, budget: Budget, strategy: Mapping[str, Any]) -> _Search:
+def _search(formulation: "Formulation", budget: Budget, strategy: Mapping[str, Any]) -> _Search:
     from ortools.sat.python import cp_model
 
     solver = cp_model.CpSolver()

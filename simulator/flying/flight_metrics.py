@@ -1,7 +1,5 @@
 """Prometheus metrics of a running flight. To bound their cardinality, no label has a mission, UAV or sensor."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterable, Iterator
@@ -45,13 +43,13 @@ class FlightMetrics:
         self._flown = Gauge("aicvds_flight_steps_flown", "Steps that the whole fleet has flown", registry=r)
         Gauge("aicvds_flight_steps", "Steps that the mission has", registry=r).set(steps)
 
-    def count_decision(self, choice: PilotChoice) -> None:
+    def count_decision(self, choice: "PilotChoice") -> None:
         """Count one decision."""
         self._decisions.labels(choice.source, choice.reason or "none").inc()
         if choice.exchange is not None:
             self._round_trip.observe(choice.exchange.rtt_ms / 1e3)
 
-    def count_step(self, flight: Flight) -> None:
+    def count_step(self, flight: "Flight") -> None:
         """Count one step of the whole fleet."""
         tally = flight.tally[-1]
         self._lost.inc(tally.lost_packets)

@@ -161,12 +161,7 @@ def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Fligh
 
 
 def _fly_again(job: Job, mode: Mode, edge: EdgeClient, console: Console) -> list[StepTally]:
-    """The tallies of the same world flown by the same edge in another mode.
-
-    Raises:
-        EdgeError: the edge refused the mission, or did not decide all of it.
-        KeyboardInterrupt: it was interrupted.
-    """
+    """The tallies of the same world flown in another mode; raises ``EdgeError`` unless the edge decides all of it."""
     from simulator.flying.flight import fly
     from simulator.flying.pilots import EdgePilot
 

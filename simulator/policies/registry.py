@@ -17,7 +17,6 @@ class Policy(Protocol):
 
     def reset(self, scenario: Scenario, seed: int) -> None:
         """Start a mission. Called before the first ``decide``."""
-        ...
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
         """Choose a sensor, and a velocity in m/s.
@@ -27,7 +26,6 @@ class Policy(Protocol):
             observation: of that UAV.
             taken: sensors chosen by earlier UAVs of this step.
         """
-        ...
 
 
 @runtime_checkable
@@ -36,7 +34,6 @@ class LearningPolicy(Protocol):
 
     def learn(self, uav: int, step: int, failed: bool) -> None:
         """Take the outcome of a UAV's decision of a step: whether the transmission failed."""
-        ...
 
 
 _POLICIES: dict[str, Callable[[], Policy]] = {

@@ -1,7 +1,5 @@
 """Worlds of one scenario that step together, in numpy; :class:`PipelineWorld` is a batch of one."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Self, TypeVar, cast
@@ -102,7 +100,7 @@ class Draw:
         root: np.random.SeedSequence,
         trace: IntArray | None = None,
         gains: GainTrace | None = None,
-    ) -> Draw:
+    ) -> "Draw":
         """The world of a seed; the traces of arrivals and gains act as they do in ``PipelineWorld``."""
         streams = Streams.of(root)
         return cls(

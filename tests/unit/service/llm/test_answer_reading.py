@@ -50,11 +50,52 @@ def test_positions_of_thoughts_are_none_of_the_answer() -> None:
         ("{\n\n\n", "{\n\n\n", False),
         (" \n ", " \n ", False),
         ("0 7", "0 7", False),
+        ("A", "A", False),
+        # Thoughts that the chat template opens in the prompt have no tag before their end.
+        ("Okay, so I need to pick", "Okay, so I need to pick", True),
+        ('{\n "sensor_id": 0', '{\n "sensor_id": 0', True),
     ],
 )
 def test_an_answer_cut_off_before_it_begins_is_unfinished(content: str | None, text: str, unfinished: bool) -> None:
     read = completion_of(answer(content, finish_reason="length"), "url")
     assert (read.text, read.unfinished) == (text, unfinished)
+
+
+@pytest.mark.parametrize(
+    ("text", "answer"),
+    [
+        ("`0 7`", "0 7"),
+        ("*0 7*", "0 7"),
+        ("<answer>0 7</answer>", "0 7"),
+        ("<|begin_of_box|>0 7<|end_of_box|>", "0 7"),
+        ("<seed:think>Hm</seed:think>0 7", "0 7"),
+        ("◁think▷Hm◁/think▷0 7", "0 7"),
+        ("<|START_THINKING|>Hm<|END_THINKING|><|START_RESPONSE|>A<|END_RESPONSE|>", "A"),
+        ("<|begin_of_thought|>Hm<|end_of_thought|>\n\n0 7", "0 7"),
+        ("0 7<eos>", "0 7"),
+        ("0 7<pad><pad>", "0 7"),
+        ("```A```", "A"),
+        ("```\nA\nB\n```", "A\nB"),
+        ("```text\nA\n```", "A"),
+        ('```json {"sensor_id": 0, "velocity": 7}```', '{"sensor_id": 0, "velocity": 7}'),
+    ],
+)
+def test_marks_around_an_answer_are_none_of_it(text: str, answer: str) -> None:
+    assert completion_of({"choices": [{"message": {"content": text}}]}, "url").text == answer
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        {"content": [{"type": "output_text", "text": "0 7"}]},
+        {"content": [{"text": "0 7"}]},
+        {"content": ["0 ", "7"]},
+        {"content": [{"type": "thinking", "text": "Hm"}, {"type": "text", "text": "0 7"}]},
+        {"content": None, "function_call": {"name": "decide", "arguments": "0 7"}},
+    ],
+)
+def test_an_answer_may_come_in_parts_of_any_kind(message: dict[str, Any]) -> None:
+    assert completion_of({"choices": [{"message": message}]}, "url").text == "0 7"
 
 
 @pytest.mark.parametrize(
