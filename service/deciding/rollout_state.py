@@ -133,11 +133,7 @@ class RolloutState:
 def _after(
     belief: FleetBelief, step: int, moved: Sequence[tuple[int, int]]
 ) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_], NDArray[np.int64]]:
-    """Queues, their ages, whether they are unknown, and last visits, ``(J,)`` each, after the step's decisions.
-
-    Args:
-        moved: the sensors that other UAVs have in this step, with the packets that they move.
-    """
+    """Queues, ages, whether unknown, last visits, ``(J,)``, after others ``moved`` (sensor, packets) in this step."""
     # Nothing can be collected from a sensor with a flat battery, so its losses do not distinguish candidates.
     queue = np.where(belief.battery > 0, belief.base, 0.0)
     age = np.maximum(step - belief.since, 0)

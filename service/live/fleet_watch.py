@@ -1,5 +1,6 @@
 """A fleet's problems in its reports: overflows by step, and silent sensors."""
 
+import math
 import time
 from collections import Counter
 from collections.abc import Iterable
@@ -56,8 +57,13 @@ class Watched:
         return {
             "overflows": round(self.overflows, 1),
             "silent": self.silent,
-            "idle_s": None if self.decided_at is None else round(time.monotonic() - self.decided_at, 1),
+            "idle_s": None if self.decided_at is None else round(self.idle_s, 1),
         }
+
+    @property
+    def idle_s(self) -> float:
+        """Seconds since the last decision; infinite before the first."""
+        return math.inf if self.decided_at is None else time.monotonic() - self.decided_at
 
 
 class FleetWatch:
@@ -89,17 +95,22 @@ class FleetWatch:
     def alarms(self, missions: Iterable[Mission]) -> Counter[str]:
         """By kind of :mod:`service.live.alarms`, the number of UAVs and sensors of the missions that fly now."""
         counts: Counter[str] = Counter()
-        for mission in missions:
-            watched, scenario = self._missions.get(mission.mission_id), mission.scenario
-            decided_at = None if watched is None else watched.decided_at
-            idle_s = _ENDED_S if decided_at is None else time.monotonic() - decided_at
-            if idle_s >= max(_ENDED_S, 6 * scenario.step_s) or mission.belief.newest == scenario.steps - 1:
-                continue
-            found = alarms(mission, mission.deadlines(), {} if watched is None else watched.batteries)
-            if idle_s > max(_SILENT_S, 3 * scenario.step_s):
-                found["uav_lost"] = dict.fromkeys(mission.belief.uavs)
-            counts.update({kind: len(subjects) for kind, subjects in found.items()})
+        for mission in filter(self._flies, missions):
+            counts.update({kind: len(subjects) for kind, subjects in self.alarms_of(mission).items()})
         return counts
+
+    def alarms_of(self, mission: Mission) -> dict[str, dict[int, int | None]]:
+        """The alarms of :mod:`service.live.alarms`; of a fleet that has fallen silent all UAVs are lost."""
+        watched = self.of(mission.mission_id)
+        found = alarms(mission, mission.deadlines(), watched.batteries)
+        if self._flies(mission) and watched.idle_s > max(_SILENT_S, 3 * mission.scenario.step_s):
+            found["uav_lost"] = dict.fromkeys(mission.belief.uavs)
+        return found
+
+    def _flies(self, mission: Mission) -> bool:
+        watched, scenario = self._missions.get(mission.mission_id), mission.scenario
+        flies = watched is not None and watched.idle_s < max(_ENDED_S, 6 * scenario.step_s)
+        return flies and mission.belief.newest != scenario.steps - 1
 
     def forget(self, mission_id: str) -> None:
         """Forget a deleted mission."""

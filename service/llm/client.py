@@ -38,13 +38,7 @@ _REDIRECTS = (301, 302, 303, 307, 308)
 
 @dataclass(slots=True)
 class _Exchange:
-    """One request and its answer.
-
-    Attributes:
-        most: bytes of body that the answer may have.
-        reused: whether the connection had an earlier request.
-        answered: whether a byte of the answer came.
-    """
+    """A request: the most bytes of its answer, whether its connection had an earlier request, whether a byte came."""
 
     most: int
     reused: bool = False

@@ -72,9 +72,7 @@ def _columns(names: tuple[str, ...]) -> tuple[NDArray[np.bool_], NDArray[np.int6
 def _example_row(write: Callable[[Cells], str], names: tuple[str, ...], kind: int) -> str:
     """A row whose known numbers have one digit.
 
-    Args:
-        kind: a number to the base 3 with one digit for each column, the first column's last: 1 for a negative number, 2
-            for an unknown one, 0 for any other.
+    ``kind`` has a digit to the base 3 for each column, the first one's last: 1 negative, 2 unknown, 0 any other.
     """
     cells = {}
     for name in names:

@@ -39,7 +39,7 @@ class BoundOptions(WorldOptions):
     time_limit_s: Annotated[float, arg(metavar="S")] = 60.0
     """Seconds of search at most, 0.1 to 86400."""
     out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """JSON file to write the bound and the plan to."""
+    """JSON file to write the bound and the plan to; it must not exist yet."""
 
 
 class BoundRecord(Record):
@@ -69,7 +69,8 @@ def _run(options: BoundOptions, console: Console) -> int:
     if options.out is not None:
         with naming_out(options.out):
             options.out.parent.mkdir(parents=True, exist_ok=True)
-            options.out.touch()
+            options.out.touch(exist_ok=False)
+            options.out.unlink()
     from simulator.bound.solver import Interrupted
     from simulator.flying.flight import rollout
     from simulator.policies.registry import policy_named

@@ -49,6 +49,13 @@ def test_the_command_prints_and_writes_the_bound(tmp_path: Path, capsys: pytest.
     shown = capsys.readouterr().out
     assert "proven optimal" in shown
     assert "bound.json" in shown
+    assert main(["--seed", "0", "--steps", "12", "--out", str(out)]) == 2
+    assert "bound.json: File exists" in capsys.readouterr().err and dict(written(out)) == record
+
+
+def test_a_world_that_cannot_be_searched_leaves_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--seed", "0", "--scenario", "windy", "--out", str(tmp_path / "bound.json")]) == 2
+    assert "wind" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 def test_ctrl_c_prints_the_best_so_far() -> None:

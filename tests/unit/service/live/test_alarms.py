@@ -109,6 +109,13 @@ def test_a_silent_fleet_has_lost_each_uav_once_also_past_its_scenarios_last_step
     assert +watch.alarms([fleet]) == {"uav_lost": 1}
     clock.ahead_s = 3 * PAPER.step_s + 30.0
     assert +watch.alarms([fleet]) == {"uav_lost": 2}
+    assert set(watch.alarms_of(fleet)["uav_lost"]) == {0, 1}, "as `GET` of the mission has them"
+
+
+def test_a_mission_that_was_loaded_again_and_not_decided_in_has_lost_nobody() -> None:
+    slow, watch = mission(MissionSpec(scenario=PAPER.model_copy(update={"step_s": 150.0}))), FleetWatch()
+    slow.observe(uav(), 0)
+    assert +watch.alarms([slow]) == {} and watch.alarms_of(slow)["uav_lost"] == {}
 
 
 def test_a_fleet_of_long_steps_is_lost_before_its_mission_counts_as_ended(monkeypatch: pytest.MonkeyPatch) -> None:
