@@ -16,7 +16,7 @@ import time
 import urllib.request
 
 LLM_S, DECISIONS = 300, 3
-MODES = ("policy", "value", "guided")
+MODES = ("policy", "value", "llm", "guided")
 
 
 def main() -> None:

@@ -1,1 +1,0 @@
-"""Code and formats that the edge service and its clients share."""

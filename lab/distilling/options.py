@@ -43,7 +43,7 @@ class Distill(TrainingOptions):
 
     Then:  python -m lab distill runs/*.jsonl.gz --out runs/adapter
 
-    The rows of a prompt and their letters are shuffled. The target of a decision is the teacher's action, with 0.6 of
+    The rows of a prompt and their letters are shuffled. The target of a decision is the teacher's sensor, with 0.2 of
     the probability, and every candidate by its expected loss, with the rest. Every eleventh mission of a file is held
     out. Training goes on where it was interrupted: the folder has its examples and its last checkpoint. A step of
     16 decisions takes some 4 s of one core that multiplies bfloat16 fast, and 12 s or more of another.

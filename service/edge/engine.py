@@ -277,7 +277,8 @@ class Engine:
         if (measured := task.mission.measured.pop(task.uav.uav_id, None)) is not None:
             self._metrics.record_measured(measured)
         self._metrics.overflow_risk.observe(decided.state.state.overflow_risk)
-        if task.mission.mode == "llm" and choice.reason != "no_candidate":
+        # Queries for letters count themselves.
+        if (task.mission.mode, task.mission.spec.prompt.format) == ("llm", "csv") and choice.reason != "no_candidate":
             self._metrics.llm_requests.labels(choice.reason or "ok").inc()
         if choice.unevaluated:
             self._metrics.evaluator_timeouts.inc()

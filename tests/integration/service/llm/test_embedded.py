@@ -125,6 +125,7 @@ def test_the_adapters_prompt_is_short_and_little_of_it_is_read_anew(report: Repo
             # The probabilities of the letters, by sensor.
             assert sum(kept["llm"] for kept in answer["top_k"]) == pytest.approx(1.0, abs=1e-3)
             read.append((answer["tokens"]["server_prompt"], answer["tokens"]["cached"]))
+        assert calls(edge) == 3
     assert all(whole <= 130 for whole, _ in read), read
     assert all(whole - cached <= 70 for whole, cached in read[1:]), read
 
