@@ -85,14 +85,22 @@ class Model(nn.Module):
     Args:
         tensors: by GGUF name, with the rows of ``token_embd.weight`` that are used alone.
         kinds: their GGUF types.
+        vocabulary: the embeddings of all tokens.
     """
 
     def __init__(
-        self, tensors: Mapping[str, np.ndarray], kinds: Mapping[str, str], rank: int, dtype: torch.dtype
+        self,
+        tensors: Mapping[str, np.ndarray],
+        kinds: Mapping[str, str],
+        vocabulary: np.ndarray,
+        rank: int,
+        dtype: torch.dtype,
     ) -> None:
         super().__init__()
         raw = {name: torch.tensor(dequantised(values, kinds[name])) for name, values in tensors.items()}
         self.register_buffer("embeddings", raw["token_embd.weight"].to(dtype))
+        all_tokens = torch.tensor(dequantised(vocabulary, kinds["token_embd.weight"]))
+        self.register_buffer("vocabulary", all_tokens.to(dtype))
         self.register_buffer("last_norm", raw["output_norm.weight"])
         self.register_buffer("frequencies", _THETA ** (-torch.arange(0, _HEAD, 2).float() / _HEAD))
         for layer in range(_LAYERS):
@@ -115,7 +123,8 @@ class Model(nn.Module):
             name: values for part in ("base0", "base1") for name, values in np.load(base / f"{part}.npz").items()
         }
         kinds = json.loads((base / "tokens.json").read_text())["kinds"]
-        return cls(tensors, kinds, _RANK, half_precision(device)).to(device)
+        vocabulary = np.load(base / "vocabulary.npz")["all"]
+        return cls(tensors, kinds, vocabulary, _RANK, half_precision(device)).to(device)
 
     def layers(self) -> list[Layer]:
         """The layers as :meth:`forward` takes them, of the adapter as it is now."""
@@ -141,6 +150,10 @@ class Model(nn.Module):
     def logits(self, states: Tensor, tokens: Tensor) -> Tensor:
         """The logits of these tokens after states."""
         return functional.linear(states, self.embeddings[tokens].to(states.dtype)).float()
+
+    def all_logits(self, states: Tensor) -> Tensor:
+        """The logits of all tokens of the vocabulary after states."""
+        return functional.linear(states, self.vocabulary.to(states.dtype)).float()
 
     def load_adapter(self, tensors: Mapping[str, np.ndarray]) -> None:
         """Take an adapter's tensors, by GGUF name."""

@@ -25,19 +25,25 @@ from lab.adapter.batches import PromptBatch, PromptTokens, RecordTensors
 from lab.adapter.model import Layer, Model
 
 # How often a prompt may show at most 1, 2, ... 10 rows.
-_SHARES = np.array([2, 3, 11, 6, 33, 5, 14, 5, 5, 16], dtype=float)
+_SHARES = np.array([2, 3, 20, 6, 30, 5, 12, 4, 4, 14], dtype=float)
 _EXPERIENCED_SHARE = 0.6
 _WARM_UP, _LEAST_RATE = 60, 0.02
 _ROWS_EVALUATED = (3, 5, 7, 10)
-_TINY = 1e-9
+_TINY, _TINY_LOGIT = 1e-9, 1e-3
 _CHECKPOINT_S = 60.0
 
 
 def loss_of(model: Model, layers: Sequence[Layer], tokens: PromptTokens, batch: PromptBatch) -> Tensor:
-    """The loss of :mod:`lab.distilling.loss`: the answer, its sensor, each row's letter and each row's worth."""
+    """The loss of :mod:`lab.distilling.loss`: the answer, its sensor, each row's letter and each row's worth.
+
+    To it comes the probability, among all tokens, that the answer is an offered letter: most LLM servers constrain
+    nothing.
+    """
     rows, options = batch.targets.shape[1:]
     states = model(batch.tokens, layers)
-    answers = model.logits(states[:, -1], tokens.letters[: rows * options]).log_softmax(1).view(batch.targets.shape)
+    letters = model.logits(states[:, -1], tokens.letters[: rows * options])
+    offered = letters.logsumexp(1) - model.all_logits(states[:, -1]).logsumexp(1)
+    answers = letters.log_softmax(1).view(batch.targets.shape)
     worth = batch.targets.sum(2)
     answer = -(batch.targets * answers).sum((1, 2)).mean()
     sensor = -(worth * (answers.exp().sum(2) + _TINY).log()).sum(1).mean()
@@ -48,27 +54,34 @@ def loss_of(model: Model, layers: Sequence[Layer], tokens: PromptTokens, batch: 
     row = ((0.5 + 2.0 * worth) * -(within * own).sum(2)).mean()
     worst, best = model.logits(after_row, tokens.digits[[0, 9]]).unbind(2)
     value = binary_cross_entropy_with_logits(best - worst, worth.clamp(max=1.0))
-    return answer + sensor + row + value
+    return answer + sensor + row + value - offered.mean()
 
 
 @torch.no_grad()
 def evaluation(model: Model, tokens: PromptTokens, records: RecordTensors, most: int, device: str) -> str:
-    """Held-out decisions: the packets lost above the best option, and how often the sensor is the planner's."""
+    """Held-out decisions: the packets lost above the best option, how often the sensor is the planner's, and how often
+    the likeliest of all tokens is an offered letter."""
     drawn = torch.Generator(device).manual_seed(1)
     lines, layers = [], model.layers()
     for k in _ROWS_EVALUATED:
-        regret, same = [], []
+        regret, same, offered = [], [], []
         for rows, which in records.groups(k, 0, held_out=True).items():
             for some in which[:most].split(512 if device == "cuda" else 32):
                 batch = records.batch(some, k, rows, 0, drawn)
                 states = model(batch.tokens, layers)[:, -1]
                 options = batch.targets.shape[2]
-                chosen = model.logits(states, tokens.letters[: rows * options]).argmax(1, keepdim=True)
+                logits = model.logits(states, tokens.letters[: rows * options])
+                # The two products are rounded each in its own way.
+                offered.append(logits.amax(1) >= model.all_logits(states).amax(1) - _TINY_LOGIT)
+                chosen = logits.argmax(1, keepdim=True)
                 regret.append(batch.regret.flatten(1).gather(1, chosen)[:, 0])
                 shown = batch.planned.flatten(1).any(1)
                 same.append(batch.planned.any(2).gather(1, chosen // options)[shown, 0].float())
         found = torch.cat(regret)
-        lines.append(f"k = {k}: regret {found.mean():.3f}, same sensor {torch.cat(same).mean():.3f}, n = {len(found)}")
+        lines.append(
+            f"k = {k}: regret {found.mean():.3f}, same sensor {torch.cat(same).mean():.3f}, "
+            f"an offered letter {torch.cat(offered).float().mean():.3f}, n = {len(found)}"
+        )
     return "\n".join(lines)
 
 
