@@ -138,7 +138,7 @@ class Settings(BaseSettings):
     top_k: int = Field(5, ge=1, le=100)
     # Experiences in the prompt before half of them are dropped; unset: 30 in the paper's prompt (mode `llm`), else 8.
     # An appended experience leaves the LLM's prefix cache valid. Dropping costs a prefill of the others, so it is rare.
-    experiences: int | None = Field(None, ge=0, le=200)
+    experiences: int | None = Field(None, ge=0, le=100)
     # The experiences in the prompt: `recent` ones, or the newest of each sensor, `failures` first.
     selection: Selection = "recent"
     # Adam's step size for the attention and velocity modules (the paper's table).

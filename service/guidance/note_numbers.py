@@ -55,11 +55,7 @@ class LetteredNote:
 
     @classmethod
     def of(cls, note: str, seed: int) -> "LetteredNote":
-        """The note with letters that the seed draws.
-
-        Raises:
-            ValueError: the note has more than 20 numbers.
-        """
+        """The note with letters that the seed draws; raises ``ValueError`` if it has more than 20 numbers."""
         lowered = note.lower()
         found = list(numbers_of(lowered))
         if len(found) > MOST_NUMBERS:

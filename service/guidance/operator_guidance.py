@@ -98,7 +98,7 @@ class OperatorGuidance:
                 raise Refused(f"guidance.{error.field}", error.detail) from None
             self._proposed, self._origin, self._failure = answer.guidance, "operator", None
             self._doubts, self._withdrawn, self.status = [], [], "confirmed"
-        elif answer.answer == "withdraw" or (answer.answer == "reject" and self.orders and self.status in _ANSWERED):
+        elif answer.answer == "withdraw" or (answer.answer == "reject" and self.orders and self.status == "confirmed"):
             self._withdraw(answer.orders, step)
         elif self._proposed is None:
             todo = "wait until the note is read" if self.status == "compiling" else "give `guidance` of your own"

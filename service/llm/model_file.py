@@ -34,11 +34,7 @@ class FetchFailed(RuntimeError):
 
 
 def embedded_model(settings: Settings) -> Path:
-    """The GGUF file to embed.
-
-    Raises:
-        ModelMissing: the file does not exist; the message names the remedy.
-    """
+    """The GGUF file to embed; raises :class:`ModelMissing` with the remedy if it does not exist."""
     path = settings.llm_gguf or settings.cache_dir / EMBEDDED_NAME
     # The file of an earlier version is slower, but usable without a download.
     earlier = path.with_name(GGUF_NAME)

@@ -145,7 +145,11 @@ class Reports:
         if len(set(places)) < 3 or (highest - lowest).max() >= _DEGREES_APART:
             path = trajectories(self._scenario)[report.uav_id]
             exact = round(x, 3) != x and round(y, 3) != y
-            if report.uav_id in self._belief.uavs or not exact or progress_of(path, (x, y)) is not None:
+            if (
+                report.uav_id in self._belief.uavs
+                or not exact
+                or progress_of(path, (x, y), report.progress_m) is not None
+            ):
                 return
         raise Refused(
             f"{at}position",

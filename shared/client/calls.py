@@ -16,6 +16,7 @@ from shared.wire.missions import MissionStatus
 from shared.wire.problem import INCOMPLETE
 from shared.wire.readings import ReadingsRequest, ReadingsResponse
 from shared.wire.schemas import (
+    MAX_COST,
     MAX_ROUND_TRIP_MS,
     DecideRequest,
     DecideResponse,
@@ -51,7 +52,7 @@ class Exchange:
     def outcome(self, cost: float, failed: bool) -> Outcome:
         """The outcome of the decision, for this UAV's next request."""
         round_trip_ms = min(round(self.rtt_ms, 3), MAX_ROUND_TRIP_MS)
-        decision_id = self.response.decision_id
+        decision_id, cost = self.response.decision_id, min(cost, MAX_COST)
         return Outcome(decision_id=decision_id, cost=cost, failed=failed, round_trip_ms=round_trip_ms)
 
     def within(self, scenario: Scenario) -> Self:

@@ -142,7 +142,7 @@ def _http_options(base_url: str, timeout_s: float, api_key: str | None) -> dict[
         raise ValueError(f"timeout_s must be positive, not {timeout_s}")
     headers: dict[str, str | bytes] = {"Content-Type": "application/json", "Accept": "application/json"}
     if api_key is not None:
-        headers["Authorization"] = f"Bearer {api_key}".encode()
+        headers["Authorization"] = f"Bearer {api_key.strip()}".encode()
     # A proxy named in the environment cannot reach an edge on this machine's loopback.
     beyond = httpx.URL(edge_url(base_url)).host not in ("localhost", "127.0.0.1", "::1")
     return {"headers": headers, "timeout": timeout_s, "trust_env": beyond}

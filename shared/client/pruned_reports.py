@@ -157,7 +157,11 @@ class PrunedReports(FullReports):
         known = self._knowledge(mission_id, uav.uav_id)
         if known is None:
             return uav
-        known.record_report(uav, step)
+        try:
+            known.record_report(uav, step)
+        except IndexError:
+            # The mission has no such UAV or sensor: the edge says which.
+            return uav
         if known.published is None or known.known_positions != (uav.sensors.id, uav.sensors.x, uav.sensors.y):
             return uav
         return uav.model_copy(update={"sensors": without_positions(uav.sensors, known.best_rows(uav, step))})

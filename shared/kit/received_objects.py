@@ -30,9 +30,9 @@ def plain(given: Any, info: ValidationInfo) -> Any:
 
 
 def _numeric(value: Any) -> bool:
-    """Whether it is a numpy value, or a list that begins with a numpy number."""
+    """Whether it is a numpy value, or a list whose first number is one of numpy's."""
     if isinstance(value, list | tuple):
-        return bool(value) and hasattr(value[0], "tolist")
+        return hasattr(next((one for one in value if one is not None), None), "tolist")
     return hasattr(value, "tolist")
 
 

@@ -69,8 +69,8 @@ class GuidanceAnswer(Received):
 
     A new note is compiled, and obeyed once it is confirmed; until then the orders before it stay. A given structure
     counts as confirmed. It needs neither an LLM nor a note. Both are added to the orders in force, or replace them.
-    `withdraw` ends the orders in force, whatever has become of the note; `reject` does the same where no proposal waits
-    for an answer.
+    `withdraw` ends the orders in force, whatever has become of the note; `reject` does the same where the proposal was
+    confirmed.
     """
 
     answer: Literal["confirm", "reject", "withdraw"] | None = None

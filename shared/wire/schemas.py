@@ -17,7 +17,7 @@ from shared.world.scenario import MAX_SENSORS, Scenario
 
 MAX_STEP = 1_000_000
 # A UAV that waited longer reports this much.
-MAX_ROUND_TRIP_MS = 600_000.0
+MAX_ROUND_TRIP_MS, MAX_COST = 600_000.0, 10_000.0
 # Characters of an operator's note, which is part of every long prompt.
 MAX_NOTE = 280
 
@@ -98,7 +98,7 @@ class Outcome(Received):
     """The outcome of an earlier decision. It counts once, however often it is sent."""
 
     decision_id: DecisionId
-    cost: float = Field(ge=0, le=10_000, description="c, 0 is best; the value regression's target is -c")
+    cost: float = Field(ge=0, le=MAX_COST, description="c, 0 is best; the value regression's target is -c")
     failed: bool = Field(False, description="the transmission failed (f = 1)")
     # Omitted if not set, so that a request repeated after an upgrade is still the same request.
     round_trip_ms: float | None = omitted(

@@ -24,8 +24,13 @@ class Received(Wire):
     _few_names = model_validator(mode="before")(few_names)
 
 
+# Spaces that are typed in other languages, or pasted.
+_SPACES = str.maketrans(dict.fromkeys("\u00a0\u202f\u3000", " "))
+
+
 def one_paragraph(text: str) -> str:
     """The text; raises ``ValueError`` for a blank one, or one with line breaks or control characters."""
+    text = text.translate(_SPACES)
     if not text.isprintable() or not text.strip():
         raise ValueError("must be one paragraph of printable characters, without line breaks or control characters")
     return text

@@ -137,7 +137,7 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
     refuse_old_result(out, options.overwrite, DECISIONS)
     own_mode = _mode_of(options.policy)
     with ExitStack() as stack:
-        edge, alive = options.edge, _no_edge
+        edge, alive = options.edge and edge_from_option(options.edge), _no_edge
         modes = [mode for mode in map(_mode_of, (options.policy, *options.against)) if mode is not None]
         if modes and edge is None:
             fresh_folder(out)
@@ -173,12 +173,11 @@ def check(options: Simulate) -> None:
     from simulator.policies.registry import policy_named
 
     check_wait(options.wait_s)
-    _check_policy("--policy", options.policy)
-    for name in options.against:
-        if name == "edge":
-            raise UsageError("--against edge: say in which mode, such as --against edge:value")
-        _check_policy("--against", name)
-        if _mode_of(name) is None:
+    if "edge" in options.against:
+        raise UsageError("--against edge: say in which mode, such as --against edge:value")
+    for option, name in (("--policy", options.policy), *(("--against", other) for other in options.against)):
+        _check_policy(option, name)
+        if name != "edge" and _mode_of(name) is None:
             policy_named(name)
     check_deadline(options.deadline_ms)
     _pace(options.pace)

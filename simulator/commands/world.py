@@ -90,11 +90,7 @@ def import_world(options: Import, console: Console) -> int:
 
 
 def export_world(options: Export, console: Console) -> int:
-    """Write the plans; returns the exit code.
-
-    Raises:
-        UsageError: the options or the world are unusable.
-    """
+    """Write the plans; returns the exit code, raises ``UsageError`` for unusable options or worlds."""
     from simulator.sites.plans.plan_folder import export_plans
 
     if options.plan is None:

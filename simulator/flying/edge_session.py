@@ -18,8 +18,8 @@ from shared.world.scenario import Scenario
 from simulator.errors import UsageError
 from simulator.flying.job import Job
 
-# Without a requested deadline the edge's default applies, which may be as long as the paper's step.
-DEFAULT_TIMEOUT_S = 10.0
+# Without a requested deadline the edge's own applies, up to a minute; three attempts wait for one answer.
+DEFAULT_TIMEOUT_S = 21.0
 NETWORK_SLACK_S = 1.0
 # The timeout of a readiness probe during an outage, short compared with the wait for the edge.
 PROBE_TIMEOUT_S = 2.0
@@ -44,11 +44,7 @@ class LossyTransport(httpx.BaseTransport):
         self._random = random.Random(f"uplink-{seed}")
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
-        """Forward the request after a delay, or lose it.
-
-        Raises:
-            httpx.ConnectTimeout: the request was lost.
-        """
+        """Forward the request after a delay, or lose it: ``httpx.ConnectTimeout``."""
         delay, luck = self._random.random() * self._jitter_s, self._random.random()
         time.sleep(delay)
         if luck < self._drop:

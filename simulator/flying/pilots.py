@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -170,8 +171,9 @@ class EdgePilot:
         began = time.monotonic()
         try:
             self._probe.wait_ready(self._wait_left_s, on_wait=self._on_wait)
-            # An edge that has restarted without a store has lost the mission.
-            self._probe.put_mission(self._mission_id, self.spec)
+            # An edge that has restarted without a store has lost the mission; one with it may have it by another spec.
+            with suppress(EdgeRefused):
+                self._probe.put_mission(self._mission_id, self.spec)
         except EdgeError as error:
             self.last_error = str(error)
         self._wait_left_s -= time.monotonic() - began
@@ -187,7 +189,11 @@ class EdgePilot:
             # A restarted edge has neither the mission nor the earlier decision: create it, and omit the outcome.
             if not (refused.mission_unknown or (request.outcome is not None and refused.concerns("outcome"))):
                 raise
-            self._client.put_mission(self._mission_id, self.spec)
+            try:
+                self._client.put_mission(self._mission_id, self.spec)
+            except EdgeRefused:
+                if refused.mission_unknown:
+                    raise
             exchange = self._client.decide(request.model_copy(update={"outcome": None}))
         self._lost, self._wait_left_s = False, self._reconnect_s
         return exchange.within(self._scenario)

@@ -82,7 +82,7 @@ def run_mission(
     extra = {"operator": operator, "without_llm": None if again is None else sum(t.lost_packets for t in again)}
     code = _write_results(job, flight, others, created.mode, model, extra, console)
     if pilot.last_error is not None:
-        unanswered = len(flight.decisions) - pilot.answered
+        unanswered = sum(decision.source == "onboard" for decision in flight.decisions)
         print(
             f"{unanswered} decisions were taken on board. The edge's last failure: {pilot.last_error}", file=sys.stderr
         )
@@ -206,7 +206,7 @@ def _operator(probe: EdgeClient, mission_id: str, flight: Flight) -> OperatorRec
     """The operator's part in the flight; ``None`` if there was none, or the edge that knows it is gone."""
     try:
         guidance, status = probe.guidance(mission_id), probe.mission(mission_id)
-    except EdgeError:
+    except (EdgeError, KeyboardInterrupt):
         return None
     in_force = [
         one for one in guidance.orders if one.since_step < flight.steps_flown and one.until_step != one.since_step

@@ -4,7 +4,7 @@ The colours are those of Okabe and Ito, distinguishable for colour-blind readers
 too.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -276,11 +276,12 @@ def visits(decisions: Sequence[Decision], sensors: int, names: Sequence[str | No
 
 def deciders(decisions: Sequence[Decision]) -> PaperFigure:
     """The sources of the decisions of each step, as stacked bars."""
-    steps = sorted({d.step for d in decisions})
+    counted: Counter[tuple[int, str]] = Counter((d.step, d.source) for d in decisions)
+    steps = sorted({step for step, _ in counted})
     with paper_figure("deciders", 2.0, (1, 1)) as (drawn, (axes,)):
         below = np.zeros(len(steps))
         for source, colour in SOURCES.items():
-            counts = np.array([sum(d.step == s and d.source == source for d in decisions) for s in steps], dtype=float)
+            counts = np.array([counted[step, source] for step in steps], dtype=float)
             if counts.any():
                 axes.bar(steps, counts, bottom=below, color=colour, label=source, edgecolor="white", linewidth=0.5)
                 below = below + counts

@@ -118,11 +118,7 @@ class Sensors:
 
     @classmethod
     def draw(cls, scenario: Scenario, streams: Streams, trace: IntArray | None = None) -> Self:
-        """One world's, before the first step.
-
-        Raises:
-            ValueError: the trace does not cover the mission.
-        """
+        """One world's, before the first step; raises ``ValueError`` if the trace does not cover the mission."""
         count, capacity = scenario.sensors, scenario.queue_capacity
         positions = draw_positions(scenario, streams.layout)
         rates = streams.rates.uniform(scenario.arrival_rate_min, scenario.arrival_rate_max, count)

@@ -42,7 +42,7 @@ def say(client: httpx.Client, **answer: Any) -> dict[str, Any]:
     ("state", "answer"),
     [
         *((state, "withdraw") for state in ("compiling", "failed", "confirmed", "rejected")),
-        *((state, "reject") for state in ("confirmed", "rejected")),
+        ("confirmed", "reject"),
     ],
 )
 def test_orders_in_force_can_be_withdrawn_whatever_the_note(

@@ -9,6 +9,8 @@ from unittest.mock import patch
 import pytest
 
 from shared.client.edge_client import EdgeClient
+from shared.client.errors import EdgeRefused
+from shared.wire.problem import Problem
 from shared.world.scenario import Scenario
 from simulator.flying.flight import fly
 from simulator.flying.pilots import EdgePilot, LocalPilot
@@ -85,6 +87,30 @@ def test_an_edge_that_restarted_gets_the_mission_again(stub: EdgeStub, client: E
     flight = fly(Site(SHORT), EdgePilot(client, "m-7", SHORT, seed=9), seed=9)
     assert all(d.source != "onboard" for d in flight.decisions)
     assert stub.missions["m-7"].scenario == SHORT and stub.missions["m-7"].seed == 9
+
+
+def test_a_decision_that_the_edge_has_lost_costs_its_outcome_alone(stub: EdgeStub, client: EdgeClient) -> None:
+    """The mission was made by `aicvds mission create`, with a note of its own."""
+    stub.script = ["ok"] * 3 + ["forgot"]
+    other = EdgeRefused("url", Problem(detail="mission m-7 has another spec"), 409)
+    with patch.object(client, "put_mission", side_effect=other):
+        flight = fly(Site(SHORT), EdgePilot(client, "m-7", SHORT, seed=9), seed=9)
+    assert all(d.source != "onboard" for d in flight.decisions)
+
+
+def test_losses_beyond_a_cost_are_the_highest_cost(stub: EdgeStub, client: EdgeClient) -> None:
+    pilot = EdgePilot(client, "m", SHORT, seed=0)
+    flight = fly(Site(SHORT), pilot, seed=0)
+    choice = next(d for d in flight.decisions)
+    assert choice.decision_id is not None
+    exchange = client.decide(stub.decides[0])
+    assert exchange.outcome(2.0**31, True).cost == 10_000.0
+
+
+def test_a_key_from_a_file_loses_its_newline(stub: EdgeStub) -> None:
+    with EdgeClient(stub.url, timeout_s=PATIENCE_S, api_key="aicvds_secret\n") as client:
+        fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0), seed=0)
+    assert {headers["authorization"] for headers in stub.headers} == {"Bearer aicvds_secret"}
 
 
 def test_a_mission_that_the_edge_has_lost_is_made_again(edge: Edge) -> None:

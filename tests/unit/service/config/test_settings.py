@@ -47,8 +47,11 @@ def test_a_key_read_from_a_file_loses_its_newline_and_never_shows() -> None:
 
 def test_experiences_that_cannot_fit_the_context_are_refused() -> None:
     with pytest.raises(ValidationError, match="AICVDS_LLM_CONTEXT"):
-        Settings(llm_adapter="off", experiences=200)
-    assert Settings(llm_adapter="off", experiences=200, llm_context=16_384).experiences == 200
+        Settings(llm_adapter="off", experiences=100, top_k=60)
+    assert Settings(llm_adapter="off", experiences=100, top_k=60, llm_context=16_384).experiences == 100
+    # More than a mission's own setting may have, so that no client could read the mission's status.
+    with pytest.raises(ValidationError, match="experiences"):
+        Settings(llm_adapter="off", experiences=101, llm_context=16_384)
 
 
 @pytest.mark.parametrize("given", [{"mode": "policy", "top_k": 67}, {"mode": "value", "top_k": 100}, {"top_k": 80}])

@@ -190,10 +190,10 @@ def test_numpys_arrays_and_numbers_are_taken() -> None:
         id=np.arange(2),  # type: ignore[arg-type]
         x=np.array([1.0, 2.0]),  # type: ignore[arg-type]
         y=[np.float64(3.0), np.float32(4.0)],  # type: ignore[list-item]
-        queue=np.array([5.0, 6.0]),  # type: ignore[arg-type]
-        battery=[7.0, 8.0],
-        channel_gain=[-80.0, -90.0],
-        last_seen=[np.int64(0), np.int64(0)],  # type: ignore[list-item]
+        queue=[None, np.float64(6.0)],  # type: ignore[list-item]
+        battery=[None, 8.0],
+        channel_gain=[None, -90.0],
+        last_seen=[None, np.int64(0)],  # type: ignore[list-item]
     )
     assert (sensors.id, sensors.x, sensors.y) == ([0, 1], [1.0, 2.0], [3.0, 4.0])
     request = DecideRequest(step=np.int64(3), uav_id=0, position=np.array([1.0, 2.0]), sensors=sensors)  # type: ignore[arg-type]
