@@ -29,11 +29,7 @@ _CLOSING_S = 4.0
 
 
 class QueryLimits:
-    """Bounds the queries to the LLM in number and in time.
-
-    Args:
-        most: the largest number of waiting queries.
-    """
+    """Bounds the queries to the LLM in time and in number: at most ``most`` wait."""
 
     def __init__(self, most: int) -> None:
         self._most = most

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 TOGETHER_TIMEOUT_S = 15.0
+# A server that asks for more is not ready.
+LONGEST_PAUSE_S = 10.0
 # More than the UAVs of any fleet.
 _ANY_NUMBER = 1000
 # No model names this sensor by itself, so a server that answers it obeys the constraint.
@@ -91,13 +93,9 @@ async def _constraint(client: LLMClient, model: str | None) -> Constraint:
         answered = perhaps_busy = False
         for constraint in _PROBES:
             try:
-                text = (await client.complete(probe_body(model, constraint))).text
-            except Unreachable:
+                text = (await _asked(client, probe_body(model, constraint))).text
+            except (Busy, Unreachable):
                 raise
-            except Busy as busy:
-                perhaps_busy = True
-                await asyncio.sleep(busy.pause_s)
-                continue
             except NoDecision as failed:
                 perhaps_busy = perhaps_busy or not isinstance(failed, NotUnderstood)
                 continue
@@ -105,7 +103,7 @@ async def _constraint(client: LLMClient, model: str | None) -> Constraint:
                 return constraint
             answered = True
         if not answered:
-            await client.complete(probe_body(model, "none"))
+            await _asked(client, probe_body(model, "none"))
         if not perhaps_busy:
             break
     return "none"
@@ -141,18 +139,25 @@ async def _answers_lists(
         return False
 
 
-async def _answer(client: LLMClient, body: dict[str, Any]) -> Completion | None:
-    """The answer to a probe, None if it fails; raises :class:`Unreachable`."""
+async def _asked(client: LLMClient, body: dict[str, Any]) -> Completion:
+    """The answer to a probe, after the short pauses that the server asks for; raises :class:`NoDecision`."""
     while True:
         try:
             return await client.complete(body)
-        except Unreachable:
-            raise
         except Busy as busy:
-            # It says nothing of what the server can do.
+            if busy.pause_s > LONGEST_PAUSE_S:
+                raise
             await asyncio.sleep(busy.pause_s)
-        except NoDecision:
-            return None
+
+
+async def _answer(client: LLMClient, body: dict[str, Any]) -> Completion | None:
+    """The answer to a probe, None if it fails; raises :class:`Busy` and :class:`Unreachable`."""
+    try:
+        return await _asked(client, body)
+    except (Busy, Unreachable):
+        raise
+    except NoDecision:
+        return None
 
 
 async def _listed_model(client: LLMClient) -> str | None:

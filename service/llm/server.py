@@ -301,11 +301,12 @@ class LlmServer:
                 return
             except (NoDecision, TimeoutError) as error:
                 self.status = ServerStatus("unavailable", str(error) or f"no answer in {PROBE_TIMEOUT_S:g} s")
-                log.warning("LLM not ready, next try in %g s: %s", RETRY_S, self.status.detail)
+                pause_s = max(RETRY_S, error.pause_s if isinstance(error, Busy) else 0.0)
+                log.warning("LLM not ready, next try in %.3g s: %s", pause_s, self.status.detail)
             except Exception as error:
                 self.status = ServerStatus("unavailable", f"{type(error).__name__}: see the log")
-                log.exception("LLM not ready, next try in %g s", RETRY_S)
-            await asyncio.sleep(RETRY_S)
+                log.exception("LLM not ready, next try in %g s", pause_s := RETRY_S)
+            await asyncio.sleep(pause_s)
 
     async def _probe_again(self) -> None:
         """Probe a ready server whose answers cannot be used: it may have another model now."""

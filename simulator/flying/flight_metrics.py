@@ -24,11 +24,7 @@ _ROUND_TRIP_BUCKETS = (0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 3
 
 
 class FlightMetrics:
-    """The metrics of one flight, in a separate registry.
-
-    Args:
-        steps: of the mission.
-    """
+    """The metrics of one flight of so many ``steps``, in a separate registry."""
 
     def __init__(self, steps: int) -> None:
         self.registry = r = CollectorRegistry()

@@ -148,6 +148,19 @@ def test_a_server_that_is_busy_as_it_is_probed_keeps_its_grammar(edge: Edge) -> 
         assert wait_for(client, "ready")["constraint"] == "grammar"
 
 
+def test_a_server_that_asks_for_a_long_pause_is_not_asked_before(edge: Edge) -> None:
+    asked = []
+
+    def has_no_quota(body: Body) -> Response | str:
+        asked.append(body)
+        return JSONResponse({"error": {"message": "quota"}}, 429, {"Retry-After": "60"})
+
+    with serving(Plain(has_no_quota).app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1", llm_model="stub-1")
+        assert "quota (no requests for 60 s)" in wait_for(client, "unavailable")["detail"]
+        assert len(asked) == 1
+
+
 def test_unusable_answers_count_against_the_server_that_gave_them_whatever_its_model(
     edge: Edge, report: Report
 ) -> None:
