@@ -43,8 +43,9 @@ _WRAPPED = re.compile(
     r"""\A\s*(?:\*\*(.*)\*\*|\*(.*)\*|"(.*)"|`(.*)`|\\boxed\{(.*)\}|<answer>(.*)</answer>|<\|[^<>]{1,40}\|>(.*))\s*\Z""",
     re.DOTALL,
 )
-# An answer that was cut before its end: thoughts that the prompt opens, or JSON.
-_PROSE = re.compile(r"\s*(?:[a-zA-Z]{3}|\{\s*\"[^}]*\Z)")
+# The beginning of an answer that was cut: of thoughts that the prompt opens (DeepSeek-R1, QwQ), or of JSON. A small
+# model that rambles would ramble on.
+_BEGUN = re.compile(r"\s*(?:(?:okay|alright|hmm+|first|let'?s|let me|we need|i need)\b|\{\s*\"[^}]*\Z)", re.IGNORECASE)
 # A fenced block's language.
 _LANGUAGE = re.compile(r"\A[a-zA-Z]+(?=\s*\n\s*\S|\s*[{\[\d])")
 # Kimi-VL writes its tags with triangles.
@@ -161,7 +162,7 @@ def completion_of(answer: Any, base_url: str, secrets: tuple[str, ...] = ()) -> 
         # vLLM's logprobs have the thoughts' tokens too, where it gives the thoughts apart.
         positions = _after_thoughts(positions) or (positions if plain == text else ())
     prompt, cached, completion = _counts(answer.get("usage"))
-    unfinished = cut and (_PROSE.match(plain) if plain.strip() else not text or reasoning or plain != text)
+    unfinished = cut and (_BEGUN.match(plain) if plain.strip() else not text or reasoning or plain != text)
     return Completion(plain, prompt, cached, completion, positions, unfinished=bool(unfinished))
 
 

@@ -19,6 +19,7 @@ from service.commands.keys import main
 from shared.client.edge_client import EdgeClient
 from shared.client.errors import EdgeRefused
 from shared.wire.schemas import DecideRequest
+from tests.support.asking import PATHS, ask
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -75,11 +76,13 @@ def test_a_key_does_what_its_scopes_say(edge: Edge, report: Report, tmp_path: Pa
         assert refused.status_code == 403
         assert "lacks the scope admin" in refused.json()["detail"]
     # Nor does it make a mission by asking about one that there is not.
-    refused = client.post("/decide", json=report(), headers=bearer(keys["uav"]))
-    assert refused.status_code == 404 and "scope admin" in refused.json()["detail"]
+    for path in PATHS:
+        [refused] = ask(client, path, report(), **bearer(keys["uav"]))
+        assert refused.status_code == 404 and "scope admin" in refused.json()["detail"]
     assert client.put("/missions/test", json=note, headers=bearer(keys["operator"])).status_code == 200
-    assert client.post("/decide", json=report(), headers=bearer(keys["operator"])).status_code == 403
-    assert client.post("/decide", json=report(), headers=bearer(keys["uav"])).status_code == 200
+    for path in PATHS:
+        statuses = [ask(client, path, report(), **bearer(keys[name]))[0].status_code for name in ("operator", "uav")]
+        assert statuses == [403, 200]
     for key in keys.values():
         assert client.get("/missions/test", headers=bearer(key)).status_code == 200
 

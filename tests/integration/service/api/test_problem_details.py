@@ -152,4 +152,4 @@ def test_a_fault_is_told_in_plain_words(edge: Edge, path: str, body: object, sai
     refused = edge().put(path, json=body)
     assert refused.status_code == 422
     assert said in refused.json()["detail"]
-    assert not {"Value error", "Extra inputs", "valid dictionary"} & set(refused.json()["detail"].split(","))
+    assert not any(words in refused.text for words in ("Value error", "Extra inputs", "valid dictionary"))

@@ -134,9 +134,37 @@ def test_bodies_that_arrive_slowly_take_nobodys_place(
         assert slow[4].recv(65536).startswith(b"HTTP/1.1 415 ")
 
 
-def begun(held: ExitStack, client: httpx.Client, asked: str) -> socket.socket:
+LIMIT = 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("header", "sent"),
+    [
+        ("content-length: 100000000", b""),
+        # One byte above the limit, in a chunk after which more may come.
+        ("transfer-encoding: chunked", b"%x\r\n" % (LIMIT + 1) + b" " * (LIMIT + 1)),
+    ],
+    ids=["by its length", "by what came of it"],
+)
+def test_a_body_above_the_limit_is_refused_before_the_rest_of_it_comes(
+    edge: Edge, header: str, sent: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.api.request_limits.BODY_S", PATIENCE_S)
+    client = edge(max_body_bytes=LIMIT)
+    with ExitStack() as held:
+        waiting = begun(held, client, "POST /decide", f"content-type: application/json\r\n{header}")
+        waiting.sendall(sent)
+        # To the end: the edge hangs up instead of reading on.
+        with waiting.makefile("rb") as said:
+            head, _, body = said.read().partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 413 ") and b"\r\nconnection: close" in head.lower()
+    assert json.loads(body)["errors"] == [{"field": "body", "problem": f"larger than {LIMIT} bytes"}]
+    assert client.get("/healthz").status_code == 200
+
+
+def begun(held: ExitStack, client: httpx.Client, asked: str, headers: str = "content-length: 10") -> socket.socket:
     """A request of whose body nothing is sent."""
     address = (client.base_url.host, client.base_url.port or 0)
     connection = held.enter_context(socket.create_connection(address, timeout=PATIENCE_S))
-    connection.sendall(f"{asked} HTTP/1.1\r\nhost: localhost\r\ncontent-length: 10\r\n\r\n".encode())
+    connection.sendall(f"{asked} HTTP/1.1\r\nhost: localhost\r\n{headers}\r\n\r\n".encode())
     return connection

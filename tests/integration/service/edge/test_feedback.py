@@ -20,6 +20,7 @@ from service.observability.metrics import Metrics
 from service.storage.journal import NullJournal
 from shared.wire.schemas import MissionSpec, Outcome
 from shared.world.step_rule import Action
+from tests.support.asking import PATHS, decide
 from tests.support.missions import attended, uav
 from tests.support.stored_missions import fly, running, same, settled, state
 
@@ -62,18 +63,19 @@ def test_an_outcome_is_learned_after_the_decision_that_it_came_with(tmp_path: Pa
     assert later != taught
 
 
+@pytest.mark.parametrize("path", PATHS)
 def test_a_request_that_comes_at_once_decides_with_every_earlier_outcome_learned(
-    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch, path: str
 ) -> None:
     """The event loop may read the next request before it trains: here it never trains by itself."""
     monkeypatch.setattr(LearningQueue, "train_some", lambda queue: None)
     with running(tmp_path / "busy.db") as (client, engine):
-        first = client.post("/decide", json=report(step=1)).json()
+        [first] = decide(client, path, report(step=1))
         outcome = {"outcome": {"decision_id": first["decision_id"], "cost": 7.0}}
-        client.post("/decide", json=report(step=2) | outcome)
+        decide(client, path, report(step=2) | outcome)
         mission = engine.missions.loaded[0]
         assert mission.learner.updates == 0
-        client.post("/decide", json=report(step=3))
+        decide(client, path, report(step=3))
         assert mission.learner.updates == 1
 
 

@@ -64,3 +64,10 @@ def test_a_note_that_the_llm_must_read_keeps_no_other_waiting(edge: Edge) -> Non
     assert guidance(client, "compiling")["note"] == waits
     client.post("/missions/test/guidance", json={"note": "visit sensor 2 every 4 steps"})
     assert guidance(client, "proposed")["in_words"] == "Visit sensor 2 at least once in every 4 steps."
+
+
+def test_the_spaces_of_other_languages_are_spaces(edge: Edge) -> None:
+    client = edge()
+    note = "Visit\u00a0sensor 3 every\u202f4\u3000steps."
+    assert client.put("/missions/test", json={"note": note}).status_code == 200
+    assert guidance(client, "proposed")["note"] == "Visit sensor 3 every 4 steps."

@@ -199,13 +199,6 @@ def test_a_note_is_one_short_printable_paragraph(edge: Edge, note: str) -> None:
     assert client.get("/missions/test").status_code == 404
 
 
-def test_the_spaces_of_other_languages_are_spaces(edge: Edge) -> None:
-    client = edge()
-    note = "Visit\u00a0sensor 3 every\u202f4\u3000steps."
-    assert client.put("/missions/test", json={"note": note}).status_code == 200
-    assert guidance(client, "proposed")["note"] == "Visit sensor 3 every 4 steps."
-
-
 @pytest.mark.parametrize(
     ("body", "field"),
     [

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime, timedelta
+import asyncio
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +14,11 @@ import pytest
 from tests.integration.service.api.test_routes import fields
 from tests.integration.service.guidance.test_ended_orders import AT, say
 from tests.integration.service.guidance.test_operator_guidance import Edge, Report
+from tests.support.asking import PATHS, decide
 from tests.support.processes import serving_edge
-from tests.support.waiting import PATIENCE_S, until
+from tests.support.running import listening
+from tests.support.stub_llm import misbehaving, saying, wait_for
+from tests.support.waiting import PATIENCE_S, Gate, until
 
 VISIT, SLOW = "Visit sensor 4 at least once in every 3 steps", "Never fly faster than 8 m/s"
 LEAK = {"sensors": [{"sensor_id": 4, "visit_every": 3}]}
@@ -113,16 +118,17 @@ def test_a_late_visit_is_an_alarm_of_the_mission(edge: Edge, report: Report) -> 
     assert client.get("/missions/test").json()["alarms"]["visit_late"] == {"4": 2}
 
 
+@pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("end", [{"step": 3}, {"steps": 3}])
-def test_an_order_ends_at_its_step(edge: Edge, report: Report, end: dict[str, Any]) -> None:
+def test_an_order_ends_at_its_step(edge: Edge, report: Report, end: dict[str, Any], path: str) -> None:
     client = edge()
     client.put("/missions/test", json={})
     told = say(client, guidance={**ended(**end), "max_velocity": 2})
     assert told["obeyed_in_words"] == f"{VISIT}. Never fly faster than 2 m/s, until step 3."
     # The last decisions of the steps before it too, which come after the first UAV's.
-    asked = [report(step=step, uav_id=uav) for step in range(4) for uav in range(3)]
-    velocities = [client.post("/decide", json=body).json()["velocity"] for body in asked]
-    assert max(velocities[:9]) <= 2 < max(velocities[9:])
+    asked = [[report(step=step, uav_id=uav) for uav in range(3)] for step in range(4)]
+    velocities = [max(decision["velocity"] for decision in decide(client, path, *bodies)) for bodies in asked]
+    assert max(velocities[:3]) <= 2 < velocities[3]
     told = client.get(AT).json()
     assert (told["obeyed_in_words"], told["ended"]) == (f"{VISIT}.", ["Never fly faster than 2 m/s, until step 3."])
     assert spans(told) == [("max_velocity", 0, 3), ("visit:4", 0, None)]
@@ -130,20 +136,48 @@ def test_an_order_ends_at_its_step(edge: Edge, report: Report, end: dict[str, An
     assert (late.status_code, fields(late)) == (422, ["guidance.ends.max_velocity.step"])
 
 
-def test_an_order_ends_at_its_time(edge: Edge, report: Report) -> None:
+@pytest.mark.parametrize("path", PATHS)
+def test_an_order_ends_at_its_time(edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch, path: str) -> None:
+    time = [datetime(2030, 5, 1, 14, 0, tzinfo=UTC)]
+
+    class Clock(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> datetime:  # type: ignore[override]
+            return time[0].astimezone(tz)
+
+    monkeypatch.setattr("service.guidance.operator_guidance.datetime", Clock)
     client = edge()
     client.put("/missions/test", json={})
-    now = datetime.now(UTC)
-    say(client, guidance=ended(time=(now + timedelta(hours=1)).isoformat()))
-    client.post("/decide", json=report())
-    assert SLOW in client.get(AT).json()["obeyed_in_words"]
-    past = client.post(AT, json={"guidance": ended(time=now.isoformat())})
+    past = client.post(AT, json={"guidance": ended(time="2030-05-01T14:00:00Z")})
     assert (past.status_code, fields(past)) == (422, ["guidance.ends.max_velocity.time"])
-    over = datetime.now(UTC) + timedelta(seconds=1)
-    say(client, guidance=ended(time=over.isoformat()))
-    until(lambda: datetime.now(UTC) > over)
-    client.post("/decide", json=report(step=1))
+    say(client, guidance=ended(time="2030-05-01T14:30:00Z"))
+    time[0] += timedelta(minutes=29, seconds=59)
+    decide(client, path, report())
+    assert SLOW in client.get(AT).json()["obeyed_in_words"]
+    time[0] += timedelta(seconds=1)
+    decide(client, path, report(step=1))
     assert client.get(AT).json()["obeyed_in_words"] == f"{VISIT}."
+
+
+@pytest.mark.parametrize(("mode", "answer", "reason"), [("llm", b"0 7", "answer_velocity"), ("guided", b"A", None)])
+def test_a_decision_that_waits_for_the_llm_obeys_orders_that_are_confirmed_meanwhile(
+    edge: Edge, report: Report, mode: str, answer: bytes, reason: str | None
+) -> None:
+    gate = Gate()
+
+    async def slowly(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await gate.passed()
+        await saying(b"200 OK", b'{"choices": [{"message": {"content": "%s"}}]}' % answer)(reader, writer)
+
+    with listening(misbehaving(slowly)) as url, ThreadPoolExecutor(1) as pool, gate:
+        client = edge(mode=mode, llm_url=f"{url}/v1", llm_model="stub-1", planner="off")
+        wait_for(client, "ready")
+        waiting = pool.submit(client.post, "/decide", json=report())
+        until(lambda: gate.came)
+        say(client, guidance={"min_velocity": 1, "max_velocity": 1})
+        gate.open()
+        told = waiting.result().json()
+        assert (told["velocity"], told["reason"]) == (1, reason)
 
 
 def test_an_order_ends_with_a_visit_that_succeeded(edge: Edge, report: Report) -> None:

@@ -175,6 +175,24 @@ def test_while_the_store_is_locked_decisions_go_on_and_feedback_is_refused(
         assert client.get("/missions/test").json() == before
 
 
+def test_an_outcome_is_acknowledged_no_sooner_than_it_is_on_disk_and_one_sent_again_neither(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def not_yet(_timeout_s: float) -> bool:
+        return False
+
+    with running(tmp_path / "m.db") as (client, engine):
+        outcome = fly(client, report, range(1))[0]
+        for named in ({"mission_id": "test"}, {}):
+            with monkeypatch.context() as slow:
+                slow.setattr(engine.journal, "stored", not_yet)
+                answers = [client.post("/feedback", json={**named, **outcome}) for _ in range(2)]
+            assert [answer.status_code for answer in answers] == [503, 503]
+            assert answers[0].json()["errors"][0]["field"] == "decision_id"
+            again = client.post("/feedback", json={**named, **outcome})
+            assert (again.status_code, again.json()["result"]) == (200, "duplicate")
+
+
 def test_what_waits_for_a_store_that_fails_is_bounded(
     tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:

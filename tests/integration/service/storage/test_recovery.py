@@ -18,6 +18,8 @@ from service.config.settings import Settings
 from service.edge import feedback
 from service.edge.stored_missions import restore_mission
 from service.errors import Refused, Unavailable
+from service.learning.learner import Learner
+from service.mission.events import Settled
 from service.mission.idempotency import IdempotentAnswers
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
@@ -25,10 +27,9 @@ from service.storage.journal import Journal
 from service.storage.operations import Change, Checkpoint, Done, Entry, WriteFailed, Writer
 from service.storage.rows import pack
 from service.storage.store import Store, StoredMission
-from shared.wire.schemas import DecideRequest, MissionSpec, Outcome
+from shared.wire.schemas import DecideRequest, MissionSpec
 from shared.world.scenario import Scenario
-from shared.world.step_rule import Action
-from tests.support.missions import attended, uav
+from tests.support.missions import uav
 from tests.support.running import serving
 from tests.support.stored_missions import copy_of, fly, locked, running, same, settled, state, writers
 from tests.support.stub_llm import StubLlm, wait_for
@@ -269,16 +270,23 @@ def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
         assert same(state(restore_mission("test", kept, Settings(mode="value"))), state(mission))
 
 
-def test_a_lesson_that_fails_leaves_the_mission_readable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    mission = Mission("test", MissionSpec(mode="value"), Settings(mode="value"))
-    sample = attended(mission, uav()).pending("a" * 32, Action(1, 7)).sample
-    assert sample is not None
-
+def test_a_lesson_that_fails_leaves_the_mission_readable(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def broken(*_: object) -> float:
         raise RuntimeError("not today")
 
-    monkeypatch.setattr(mission.learner, "update", broken)
-    assert mission.learn(sample, 0.5) is None
+    with running(tmp_path / "m.db") as (client, engine):
+        monkeypatch.setattr(Learner, "update", broken)
+        fly(client, report, range(3))
+        store = Store(str(copy_of(tmp_path / "m.db", tmp_path / "copy.db")))
+        kept = store.load("test")
+        store.close()
+        assert kept is not None
+        assert [event.for_training for event in kept.events if isinstance(event, Settled)] == [True] * 6
+        restored = restore_mission("test", kept, Settings(mode="value"))
+        assert same(state(restored), state(engine.missions.loaded[0]))
+    assert (restored.decisions, restored.feedback, restored.learner.updates) == (9, 6, 0)
 
 
 async def test_who_waits_for_a_request_that_is_given_up_is_told_to_send_it_again(report: Report) -> None:
@@ -316,7 +324,7 @@ def test_a_key_is_known_longer_than_the_outcome_that_came_with_it(tmp_path: Path
         engine.missions.loaded[0].pending.applied.load_state_dict([])
         again = client.post("/decide", json=body, headers={"Idempotency-Key": "k"})
         assert (again.status_code, again.json()["decision_id"]) == (200, answer["decision_id"])
-        assert Outcome.model_validate(body["outcome"]).cost == 0.5
+        assert client.get("/missions/test").json()["feedback"] == 1
 
 
 @pytest.mark.parametrize("form", ["text", "json"])

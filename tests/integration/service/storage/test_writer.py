@@ -48,6 +48,9 @@ def test_a_writer_that_is_killed_is_followed_by_another_and_nothing_is_lost(
             impatient.setattr("service.edge.engine.STORE_S", 0.1)
             told = client.post("/decide", json=report(step=2, outcome=owed[0]))
         assert (told.status_code, told.json()["stored"]) == (200, False)
+        # Nor does an answer wait past its UAV's deadline.
+        late = client.post("/decide", json=report(step=2, uav_id=1, deadline_ms=100))
+        assert (late.status_code, late.json()["stored"]) == (200, False)
         first.kill()
         # Nobody is told: another process writes what this one was to write.
         assert client.post("/decide", json=report(step=3)).json()["stored"]

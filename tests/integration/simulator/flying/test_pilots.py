@@ -91,7 +91,7 @@ def test_an_edge_that_restarted_gets_the_mission_again(stub: EdgeStub, client: E
 
 def test_a_decision_that_the_edge_has_lost_costs_its_outcome_alone(stub: EdgeStub, client: EdgeClient) -> None:
     """The mission was made by `aicvds mission create`, with a note of its own."""
-    stub.script = ["ok"] * 3 + ["forgot"]
+    stub.script = ["ok", "ok", "ok", "forgot"]
     other = EdgeRefused("url", Problem(detail="mission m-7 has another spec"), 409)
     with patch.object(client, "put_mission", side_effect=other):
         flight = fly(Site(SHORT), EdgePilot(client, "m-7", SHORT, seed=9), seed=9)

@@ -38,8 +38,8 @@ class Flown:
     def state(self) -> AttendedState:
         return attended(self.mission, self.report, self.report.step)
 
-    def read(self) -> None:
-        self.mission.propose_guidance(ORDERS, "an LLM")
+    def read(self, orders: object = ORDERS) -> None:
+        self.mission.propose_guidance(Guidance.model_validate(orders), "an LLM")
 
 
 def prompted(state: AttendedState) -> tuple[np.ndarray, np.ndarray]:
@@ -64,15 +64,14 @@ def test_a_visits_deadline_is_a_queue_that_overflows_then_and_a_weight_scales_a_
 
 
 def test_a_visit_that_is_due_is_in_the_prompt_even_where_attention_has_kept_others() -> None:
-    flown = Flown("llm", steps=5)
-    before = flown.state()
-    flown.read()
+    flown = Flown("llm", steps=8)
+    assert 0 not in flown.state().kept_ids
+    flown.read({"sensors": [{"sensor_id": 0, "visit_every": 4}]})
     state = flown.state()
     assert state.prompt_view.reach is not None
-    reached = state.prompt_view.reach.best_packets[state.state.ids == 4][0]
+    reached = state.prompt_view.reach.best_packets[state.state.ids == 0][0]
     assert reached > 0.9 * CAPACITY
-    assert 4 in state.kept_ids
-    assert state.kept_ids.index(4) < (before.kept_ids + [4]).index(4) or before.kept_ids[0] == 4
+    assert 0 in state.kept_ids
 
 
 def test_in_mode_llm_the_candidates_obey_the_reading_and_the_fleets_own_rules_wait_for_the_operator() -> None:
@@ -101,8 +100,7 @@ def test_orders_in_force_stay_in_the_prompt_beside_a_second_note_that_was_only_r
     flown = Flown("llm")
     flown.mission.answer_guidance(GuidanceAnswer(guidance=ORDERS))
     flown.mission.answer_guidance(GuidanceAnswer(note="visit sensor 7 now and then"))
-    second = {"sensors": [{"sensor_id": 7, "visit_every": 4}], "min_velocity": 3}
-    flown.mission.propose_guidance(Guidance.model_validate(second), "an LLM")
+    flown.read({"sensors": [{"sensor_id": 7, "visit_every": 4}], "min_velocity": 3})
     state = flown.state()
     shown, true = prompted(state)
     assert shown[2] == 0 < true[2]
@@ -116,7 +114,7 @@ def test_a_reading_that_orders_nothing_or_the_contrary_takes_no_order_in_force_a
     flown = Flown("llm")
     flown.mission.answer_guidance(GuidanceAnswer(guidance=ORDERS))
     flown.mission.answer_guidance(GuidanceAnswer(note="hm"))
-    flown.mission.propose_guidance(Guidance.model_validate(second), "an LLM")
+    flown.read(second)
     state = flown.state()
     assert prompted(state)[0][2] == 0
     assert max(velocity for _, velocity in candidates_of(state, template_of(flown.mission)).actions) <= 6

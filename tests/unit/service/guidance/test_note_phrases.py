@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime, timedelta
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -128,15 +126,6 @@ def test_a_plain_order_and_its_end_need_no_llm(note: str, words: str) -> None:
     found = phrased(note)
     guidance, doubts = found.completed(NO_GUIDANCE, ())
     assert (found.is_read, guidance.in_words(), doubts) == (True, words, [])
-
-
-@pytest.mark.parametrize("clock", ["14:30", "2:30 pm", "14.30 h", "14h30"])
-def test_a_time_of_the_clock_is_the_next_one(clock: str) -> None:
-    guidance, doubts = phrased(f"Max 9 m/s until {clock}.").completed(NO_GUIDANCE, ())
-    end = guidance.ends["max_velocity"].time
-    assert end is not None and not doubts
-    assert (end.astimezone().hour, end.minute) == (14, 30)
-    assert timedelta(0) < end - datetime.now(UTC) <= timedelta(days=1)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from datetime import datetime, timedelta
+from datetime import datetime
 
 import pytest
 
@@ -96,24 +96,29 @@ def berlin(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.mark.usefixtures("berlin")
 @pytest.mark.parametrize(
-    ("now", "until", "offset_h"),
+    ("now", "until", "end"),
     [
-        (datetime(2026, 10, 24, 20, 0), "14:30", 1),
-        (datetime(2027, 3, 27, 20, 0), "8 am", 2),
-        (datetime(2027, 7, 1, 6, 0), "8 am", 2),
+        ("2027-07-01T14:29", "14:30", "2027-07-01T14:30:00+02:00"),
+        ("2027-07-01T14:29", "2:30 pm", "2027-07-01T14:30:00+02:00"),
+        ("2027-07-01T14:29", "14.30 h", "2027-07-01T14:30:00+02:00"),
+        ("2027-07-01T14:29", "14h30", "2027-07-01T14:30:00+02:00"),
+        ("2027-07-01T14:30", "14:30", "2027-07-02T14:30:00+02:00"),
+        ("2027-12-31T20:00", "8 am", "2028-01-01T08:00:00+01:00"),
+        # Between the two the clocks are changed.
+        ("2026-10-24T20:00", "14:30", "2026-10-25T14:30:00+01:00"),
+        ("2027-03-27T20:00", "8 am", "2027-03-28T08:00:00+02:00"),
     ],
 )
-def test_a_time_of_tomorrow_is_in_tomorrows_zone(
-    monkeypatch: pytest.MonkeyPatch, now: datetime, until: str, offset_h: int
+def test_a_time_of_the_clock_is_the_next_one_in_the_zone_of_its_day(
+    monkeypatch: pytest.MonkeyPatch, now: str, until: str, end: str
 ) -> None:
     class Clock(datetime):
         @classmethod
         def now(cls, tz: object = None) -> datetime:  # type: ignore[override]
-            return now
+            return datetime.fromisoformat(now)
 
     monkeypatch.setattr(note_phrases, "datetime", Clock)
-    phrased = PhrasedNote(f"Visit sensor 4 every 3 steps until {until}.", PAPER, ())
-    guidance, doubts = phrased.completed(NO_GUIDANCE, frozenset())
-    [end] = guidance.ends.values()
-    assert doubts == [] and end.time is not None
-    assert end.time.utcoffset() == timedelta(hours=offset_h)
+    guidance, doubts = PhrasedNote(f"Max 9 m/s until {until}.", PAPER, ()).completed(NO_GUIDANCE, frozenset())
+    time_of_end = guidance.ends["max_velocity"].time
+    assert doubts == [] and time_of_end is not None
+    assert time_of_end.isoformat() == end

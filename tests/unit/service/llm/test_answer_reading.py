@@ -53,6 +53,8 @@ def test_positions_of_thoughts_are_none_of_the_answer() -> None:
         ("A", "A", False),
         # Thoughts that the chat template opens in the prompt have no tag before their end.
         ("Okay, so I need to pick", "Okay, so I need to pick", True),
+        # A small model that rambles would do so in any number of tokens.
+        ("Hello! How can I", "Hello! How can I", False),
         ('{\n "sensor_id": 0', '{\n "sensor_id": 0', True),
     ],
 )

@@ -190,7 +190,7 @@ def test_numpys_arrays_and_numbers_are_taken() -> None:
         id=np.arange(2),  # type: ignore[arg-type]
         x=np.array([1.0, 2.0]),  # type: ignore[arg-type]
         y=[np.float64(3.0), np.float32(4.0)],  # type: ignore[list-item]
-        queue=[None, np.float64(6.0)],  # type: ignore[list-item]
+        queue=[None, np.float64(6.0)],
         battery=[None, 8.0],
         channel_gain=[None, -90.0],
         last_seen=[None, np.int64(0)],  # type: ignore[list-item]
