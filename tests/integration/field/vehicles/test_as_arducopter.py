@@ -22,9 +22,11 @@ from tests.support.airframe import Item, once
 from tests.support.edge_stub import free_port
 from tests.support.flights import arguments, becomes
 from tests.support.processes import output_until, started
-from tests.support.pymavlink_peer import ARDUPILOT, PAUSE, PX4, SPEED, pymavlink_peer
-from tests.support.waiting import PATIENCE_S
+from tests.support.pymavlink_peer import ARDUPILOT, PAUSE, POSITION, PX4, SPEED, pymavlink_peer
+from tests.support.waiting import PATIENCE_S, Striding, soon
 from tests.support.world_folders import EXAMPLE
+
+BATTERY_STATUS, SET_MESSAGE_INTERVAL = 147, 511
 
 
 @pytest.mark.parametrize("answers", [True, False], ids=["acknowledged", "not answered"])
@@ -45,12 +47,22 @@ async def test_an_ardupilot_is_asked_for_its_position_and_again_after_a_gap(
             await becomes(uav, None)
 
 
-async def test_an_autopilot_that_streams_is_asked_for_nothing(missions: list[list[Item]], port: int) -> None:
+async def test_an_autopilot_that_streams_its_position_is_not_asked_for_it(
+    missions: list[list[Item]], port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The time stands still: no position is late, however busy the machine is.
+    monkeypatch.setattr("field.vehicles.mavlink_vehicle.time", Striding(0.0))
     with pymavlink_peer(missions[0], port) as peer:
+
+        def asked() -> list[float]:
+            found = [m for _, m in list(peer.received) if m.get_type() == "COMMAND_LONG"]
+            return [m.param1 for m in found if m.command == SET_MESSAGE_INTERVAL]
+
         async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
             await becomes(FieldUav(0, vehicle, site_from_folder(EXAMPLE)), None)
-        asked = [m for _, m in peer.received if m.get_type() == "COMMAND_LONG" and m.command == 511]
-        assert all(m.param1 != 33 for m in asked)
+            # It sends no battery, and is asked for that after a second; for a position it would be asked before.
+            await soon(lambda: BATTERY_STATUS in asked())
+            assert POSITION not in asked()
 
 
 async def test_decisions_begin_at_the_height_of_the_path_or_on_the_way(missions: list[list[Item]], port: int) -> None:

@@ -17,10 +17,11 @@ from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.plans.mission_path import DELAY, TAKEOFF, WAYPOINT, MissionItem, path_of
 from tests.integration.field.vehicles.test_field_flight import Counting, Trial, nobody
 from tests.support.airframe import Item
+from tests.support.edge_stub import stub_edge
 from tests.support.flights import becomes
 from tests.support.pymavlink_peer import ARDUPILOT, pymavlink_peer
 from tests.support.stub_vehicle import StubVehicle
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, soon
 from tests.support.world_folders import EXAMPLE
 
 BATTERY_STATUS = 147
@@ -80,19 +81,18 @@ async def test_a_uav_that_waits_without_an_answer_goes_on_with_its_next_decision
     assert vehicle.commands == ["hold", "resume", 8.0]
 
 
-async def test_a_flight_that_is_cancelled_while_a_uav_holds_lets_it_go_on() -> None:
+async def test_a_flight_that_is_cancelled_while_a_uav_is_told_to_hold_lets_all_go_on() -> None:
     trial = Trial()
     vehicle = unheard(trial, hangs=True)
-    await trial.uavs[0].update(0.0)
-    holding = asyncio.create_task(trial.uavs[0].command(0))
-    async with asyncio.timeout(PATIENCE_S):
-        while vehicle.mode != "hold":
-            await asyncio.sleep(0)
-    holding.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await holding
-    await trial.uavs[0].resume_mission()
-    assert vehicle.commands == ["hold", "resume"]
+    with stub_edge() as edge:
+        edge.velocity = 0
+        flying = asyncio.create_task(trial.fly(edge.url))
+        await soon(lambda: {one.mode for one in (vehicle, *trial.vehicles[1:])} == {"hold"})
+        flying.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await flying
+    for one in (vehicle, *trial.vehicles[1:]):
+        assert (one.commands, one.mode) == (["hold", "resume"], "mission")
 
 
 async def test_a_uav_that_stays_in_place_in_its_mission_is_named() -> None:

@@ -16,11 +16,12 @@ from shared.client.calls import Exchange
 from shared.client.edge_client import AsyncEdgeClient
 from shared.client.errors import EdgeRefused
 from shared.wire.problem import Problem
-from shared.wire.schemas import FeedbackRequest, FeedbackResponse
+from shared.wire.schemas import DecideRequest, FeedbackRequest, FeedbackResponse
 from shared.world.scenario import SCENARIOS
 from simulator.flying.pilots import PilotChoice
 from tests.conftest import Edge
 from tests.integration.field.vehicles.test_field_flight import Counting, Trial, nobody
+from tests.support.edge_stub import stub_edge
 from tests.support.waiting import PATIENCE_S
 
 
@@ -89,6 +90,31 @@ async def test_an_outcome_that_is_refused_at_landing_keeps_no_other_back() -> No
             pilot.learn(uav, PilotChoice(0, 7, "policy", "mode_policy", Exchange(answer, 1.0, 1, 1, 1)), 0.0, False)
         await pilot.land()
     assert len(sent) == 3 and pilot.last_error is not None and "unknown decision" in pilot.last_error
+
+
+async def test_an_outcome_that_the_edge_could_not_store_is_sent_again_at_landing() -> None:
+    class Unstoring(AsyncEdgeClient):
+        """Its edge's disk fails at step 1."""
+
+        async def decide(self, request: DecideRequest, attempts: int | None = None) -> Exchange:
+            found = await super().decide(request, attempts)
+            return replace(found, response=found.response.model_copy(update={"stored": request.step != 1}))
+
+    trial, given = Trial(), []
+    with stub_edge() as edge:
+        async with Unstoring(edge.url, timeout_s=PATIENCE_S) as client:
+            pilot = FieldPilot(client, "field", trial.site.scenario, PATIENCE_S)
+            await trial.uavs[0].update(0.0)
+            for step in range(4):
+                choice = (await pilot.decide({0: trial.uavs[0].observation(step)}))[0]
+                assert choice.exchange is not None
+                given.append(choice.exchange.response.decision_id)
+                pilot.learn(0, choice, cost=0.25, failed=False)
+            await pilot.land()
+    assert [request.outcome and request.outcome.decision_id for request in edge.decides] == [None, *given[:3]]
+    # The first decision's outcome came with the second request, and the last one's with none.
+    assert [outcome.decision_id for outcome in edge.feedbacks] == [given[0], given[3]]
+    assert {outcome.cost for outcome in edge.feedbacks} == {0.25}
 
 
 async def test_a_mission_that_was_flown_before_is_named(edge: Edge, capsys: pytest.CaptureFixture[str]) -> None:

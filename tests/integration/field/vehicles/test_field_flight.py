@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from shared.world.trajectory import trajectories
 from simulator.errors import UsageError
 from simulator.records.decision import Decision
 from simulator.records.real_uavs import sums_by_uav
+from simulator.sites.fence import Fence
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.site import Site
 from tests.conftest import Edge
@@ -30,6 +32,8 @@ from tests.support.waiting import PATIENCE_S
 from tests.support.world_folders import EXAMPLE
 
 STEPS = 12
+# Of the first UAV's path, metres.
+START = (149.195, 2000.464)
 
 
 class Trial:
@@ -280,11 +284,23 @@ async def test_a_uav_that_flies_on_after_landing_is_commanded_to_the_end() -> No
     assert [d.step for d in flown.decisions if d.uav_id == 1] == [0, 1, 2, 3, *range(5, STEPS)]
 
 
-async def test_a_uav_off_its_path_or_outside_the_fence_gets_no_command() -> None:
+async def test_a_uav_off_its_path_gets_no_command() -> None:
     trial = Trial()
     trial.vehicles[0].shift_m = 150.0
     flown = await trial.fly(nobody(), attempts=1)
     assert trial.vehicles[0].commands == [] and flown.undecided == {"it is off its path": STEPS}
+    assert {d.uav_id for d in flown.decisions} == {1, 2}
+
+
+# Both circles are around where the first UAV begins; it flies on its path throughout.
+@pytest.mark.parametrize("fence", [Fence("no_fly", (START,), 1000.0), Fence("fence", (START,), 25.0)])
+async def test_a_uav_outside_the_fence_gets_no_command(fence: Fence) -> None:
+    trial = Trial()
+    trial.uavs[0] = FieldUav(0, trial.vehicles[0], replace(trial.site, fences=(fence,)))
+    flown = await trial.fly(nobody(), attempts=1)
+    inside = int(fence.role == "fence")
+    assert flown.undecided == {"it is outside the fence": STEPS - inside}
+    assert len(trial.vehicles[0].commands) == inside and len(flown.decisions) == 2 * STEPS + inside
 
 
 async def test_the_simulated_sensors_are_those_of_simulate() -> None:
