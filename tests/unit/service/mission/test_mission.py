@@ -56,7 +56,7 @@ def test_experiences_grow_by_appending_and_are_compacted_at_once() -> None:
         texts.append("".join(m.experiences.block))
     assert all(later.startswith(earlier) for earlier, later in itertools.pairwise(texts[:4]))
     assert len(m.experiences.block) == 3
-    assert [line.split()[-1] for line in m.experiences.block] == ["0.4", "0.5", "0.6"]
+    assert [line.split()[-1] for line in m.experiences.block] == ["0.40", "0.50", "0.60"]
 
 
 def test_no_experiences_when_told_so() -> None:

@@ -236,7 +236,7 @@ def test_past_experiences_and_waypoint_come_with_the_decision() -> None:
         past = prompt.experiences.splitlines()
         assert len(past) == step
         # The previous state in seven numbers, the sensor, the velocity and the cost.
-        assert all(re.fullmatch(r"(-?\d+,){6}\d+ > 1 7: 0\.1", line) for line in past)
+        assert all(re.fullmatch(r"(-?\d+,){6}\d+ > 1 7: 0\.12", line) for line in past)
         waypoint, *rows = prompt.state.splitlines()
         assert waypoint == f"UAV at {500 + step},450"
         assert rows and all(len(row.split(",")) == 8 for row in rows)
