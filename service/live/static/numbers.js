@@ -21,7 +21,7 @@ export function showNumbers(mission) {
   const unknown = now.heard.filter((step) => step < 0).length;
   cell("Step", String(now.step), `of ${scenario.steps}, from 0; ${scenario.step_s} s each`);
   cell("Overflows", `≈ ${shown(now.overflows, 0)}`, `believed, since the edge started; a sensor counts once a step. ${full} full now${unknown ? `; unknown of ${unknown} never heard` : ""}`);
-  cell("Failed", String(totals.failed), totals.told ? `of ${totals.told} reported transmissions that this page knows; cost ${shown(totals.cost, 1)}, with losses in reach only` : "no transmission reported yet");
+  cell("Failed", String(totals.failed), totals.told ? `of ${totals.told} reported transmissions${totals.seen < now.made ? " that this page knows" : ""}; cost ${shown(totals.cost, 1)}, with losses in reach only` : "no transmission reported yet");
   cell(roundTrip ? "Round trip" : "Edge's time", typical === null ? "–" : `${shown(typical)} ms`,
     typical === null ? "no decision yet" : `median of the newest ${times.length}; slowest ${shown(times.at(-1))} ms`, "time");
   cell("Decisions", shown(now.made, 0), `${totals.seen < now.made ? `of ${shown(totals.seen, 0)}: ` : ""}${[...sources].sort((a, b) => b[1] - a[1]).map(([source, n]) => `${n} ${SOURCES[source] ?? source}`).join(", ") || "none yet"}`, "Decisions", "deciders-numbers");
