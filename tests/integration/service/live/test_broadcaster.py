@@ -213,6 +213,10 @@ def names_until(listener: socket.socket, step: int) -> list[str]:
     """Of the events that a listener finds when it reads on, until one tells of this step, or the stream ends."""
     names = []
     for line in listener.makefile("rb"):
+        if not line.endswith(b"\n"):
+            # It is cut off in mid-event.
+            names.append("end")
+            break
         if line.startswith(b"event: "):
             names.append(line.split()[1].decode())
         elif line.startswith(b"data: ") and json.loads(line[6:])["step"] >= step:
