@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 # Listeners of all missions together.
 MAX_LISTENERS = 32
-_PERIOD_S = 0.1
+_PERIOD_S, _LONGEST_PERIOD_S = 0.1, 2.0
 # The largest share of the event loop's time for updates: one for 2,000 sensors takes milliseconds.
 _SHARE = 0.05
 # The backlog of updates for late listeners, in number and in bytes.
@@ -98,7 +98,7 @@ class MissionStream:
                 self._advance()
             except Exception:
                 log.exception("mission %s: its page gets no update; decisions go on", self.mission.mission_id)
-            await asyncio.sleep(max(_PERIOD_S, (time.perf_counter() - began) / _SHARE))
+            await asyncio.sleep(pause_s(time.perf_counter() - began))
 
     def _advance(self) -> None:
         """Make the next update."""
@@ -123,8 +123,7 @@ class MissionStream:
 
     def _snapshot(self) -> bytes:
         """The snapshot at the last update, the same for a second; the next update has every later change."""
-        # It has the seconds since the newest decision and reports.
-        made = self._made, int(time.monotonic())
+        made = self._made, int(time.monotonic())  # It has the seconds since the newest decision and reports.
         if self._last_snapshot is None or self._last_snapshot[0] != made:
             decisions = self._history.of(self.mission.mission_id)[-_SHOWN:]
             shown = snapshots.snapshot(self.mission, decisions, self._watched, self._history.edge)
@@ -215,6 +214,11 @@ class Broadcaster:
                 stream.close()
                 if self._streams.get(mission.mission_id) is stream:
                     del self._streams[mission.mission_id]
+
+
+def pause_s(took_s: float) -> float:
+    """The seconds between two updates, by those that the last one took; a stall delays the next by little."""
+    return min(max(_PERIOD_S, took_s / _SHARE), _LONGEST_PERIOD_S)
 
 
 def _event(name: str, data: bytes) -> bytes:

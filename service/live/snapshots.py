@@ -72,8 +72,6 @@ def drawn_places(mission: Mission) -> bytes:
 
 
 _SHOWN = {"name", "sensors", "uavs", "steps", "area_m", "step_s", "queue_capacity", "radio_radius_m", "max_velocity"}
-
-
 # The excess loss from which the page shows an alarm, dB: a tenth of the power arrives.
 _WORSE_DB = 10.0
 # Steps whose numbers an update repeats, so that none is missed.
