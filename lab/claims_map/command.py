@@ -23,7 +23,7 @@ class MapOptions:
 
     Every setting is flown by the paper's EOF, WQCS and MADQN, by our MADQN and MAPPO, all with the shipped weights, by
     mode `value`, and by one step of look-ahead in the LLM's place behind attention (k of 3, 5, 7 and all sensors; from
-    the shipped and from a random start). One process takes an hour or two. Each scheme's flights at a setting are a
+    the shipped and from a random start). One process takes some 20 minutes. Each scheme's flights at a setting are a
     file of --out, and the same command continues after Ctrl-C or a crash. Written to --out: claims-map.csv (a line a
     setting and claim), claims-map-curves.csv (a line a setting and scheme), and the figure.
 
