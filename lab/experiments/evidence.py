@@ -63,8 +63,15 @@ def difference(result: Result, scheme: str, reference: str, measure: str) -> Pai
 
 
 def ratio(result: Result, scheme: str, reference: str, measure: str) -> Paired:
-    """``scheme``'s mean to ``reference``'s, over the worlds that both flew; raises as :func:`difference`."""
-    return _compared(result, scheme, reference, measure)[1]
+    """``scheme``'s mean to ``reference``'s, over the worlds that both flew.
+
+    Raises:
+        Unmeasured: as :func:`difference`, or the reference's mean is 0 in these worlds or in a resample of them.
+    """
+    found = _compared(result, scheme, reference, measure)
+    if len(found) < 2:
+        raise Unmeasured(f"{measure} of {reference} is 0 in too many worlds for a ratio")
+    return found[1]
 
 
 def _compared(result: Result, scheme: str, reference: str, measure: str) -> Sequence[Paired]:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from lab.experiments.claims import WITH_ADAPTER, ClaimFinding, Verdict, judge, judge_with_adapter
-from lab.experiments.evidence import beats_chance, difference, settled_at
+from lab.experiments.evidence import Unmeasured, beats_chance, difference, ratio, settled_at
 from lab.experiments.result import Result, Sweep
 from tests.support.made_results import interval, result, zero_from
 
@@ -208,3 +208,10 @@ def test_pairs_are_of_the_worlds_that_both_flew() -> None:
     many = interval(0.0).model_copy(update={"values": [float(n) for n in range(30)]})
     made = result("scheduler", {"llm": {"lost_packets": few}, "eof": {"lost_packets": many}}, seeds_of={"llm": [5, 20]})
     assert difference(made, "llm", "eof", "lost_packets").mean == pytest.approx((10 - 5 + 30 - 20) / 2)
+
+
+def test_nothing_is_a_share_of_nothing() -> None:
+    made = result("scheduler", {"llm": {"lost_packets": 3.0}, "eof": {"lost_packets": 0.0}})
+    assert difference(made, "llm", "eof", "lost_packets").mean == pytest.approx(3.0)
+    with pytest.raises(Unmeasured, match="lost_packets of eof is 0"):
+        ratio(made, "llm", "eof", "lost_packets")
