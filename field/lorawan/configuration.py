@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from shared.kit.text_files import UnusableFile, text_of
+from shared.kit.text_files import text_of
 from shared.kit.validation_messages import problem_of
 from shared.wire.schemas import MissionId, SensorId
 
@@ -148,10 +148,9 @@ def read_configuration(path: Path, broker_url: str | None = None) -> Configurati
     Raises:
         ConfigurationError: the file or one that it names cannot be read, or a field is wrong.
     """
+    text = text_of(path, _MAX_BYTES, ConfigurationError)
     try:
-        found = Configuration.model_validate(_with_broker(tomllib.loads(text_of(path, _MAX_BYTES)), broker_url))
-    except UnusableFile as error:
-        raise ConfigurationError(str(error)) from None
+        found = Configuration.model_validate(_with_broker(tomllib.loads(text), broker_url))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")

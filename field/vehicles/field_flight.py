@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -33,18 +33,8 @@ _IN_PLACE_M = 1.0
 T = TypeVar("T")
 
 
-class Clock(Protocol):
-    """Seconds of the mission since some instant."""
-
-    def now(self) -> float:
-        """The present time, seconds."""
-
-    async def until(self, time_s: float) -> None:
-        """Wait until then; not at all if it is over."""
-
-
 class MissionClock:
-    """The machine's clock, ``speedup`` times as fast."""
+    """Seconds since some instant, by the machine's clock, ``speedup`` times as fast."""
 
     def __init__(self, speedup: float = 1.0) -> None:
         self._speedup = speedup
@@ -54,7 +44,7 @@ class MissionClock:
         return time.monotonic() * self._speedup
 
     async def until(self, time_s: float) -> None:
-        """Wait until then."""
+        """Wait until then; not at all if it is over."""
         await asyncio.sleep(max(0.0, time_s - self.now()) / self._speedup)
 
 
@@ -110,7 +100,7 @@ class FieldFlight:
         uavs: Sequence[FieldUav],
         radio: Radio,
         pilot: FieldPilot,
-        clock: Clock | None = None,
+        clock: MissionClock | None = None,
         on_decision: Callable[[Decision], None] = lambda decision: None,
         on_event: Callable[[int, str], None] = lambda uav, text: None,
     ) -> None:

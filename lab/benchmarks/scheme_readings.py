@@ -51,7 +51,7 @@ class Reading(EarliestOverflowFirst):
         super().__init__(coordinated)
         self._growth_of, self._channel, self._velocity, self._among = growth, channel, VELOCITIES[velocity], among
 
-    def priority(self, uav: int, observation: Observation) -> FloatArray:
+    def score(self, uav: int, observation: Observation) -> FloatArray:
         """The priority of every sensor, shape ``(J,)``."""
         gain = observation["channel_gain"]
         quality = {
@@ -64,7 +64,7 @@ class Reading(EarliestOverflowFirst):
         if self._growth_of is None:
             return np.asarray(observation["queue"] * quality)
         before = self._growth[uav].copy(), self._queue[uav].copy(), self._heard[uav].copy()
-        super().priority(uav, observation)
+        super().score(uav, observation)
         if self._growth_of == "newest change":
             change = (observation["queue"] - before[1]) / np.maximum(observation["last_heard"] - before[2], 1)
             new = (before[2] >= 0) & (observation["last_heard"] > before[2])
@@ -81,7 +81,7 @@ class Reading(EarliestOverflowFirst):
             known = taken if self._coordinated else frozenset[int]()
             among = free_sensors(len(observation["queue"]), known) & (observation["last_heard"] >= 0)
             if among.any():
-                sensor = int(np.argmax(np.where(among, self.priority(uav, observation), -np.inf)))
+                sensor = int(np.argmax(np.where(among, self.score(uav, observation), -np.inf)))
         if self._velocity is not None:
             away = np.hypot(*(observation["sensor_position"][sensor] - observation["position"]))
             velocity = self._velocity[0] if away > 50.0 else self._velocity[1]

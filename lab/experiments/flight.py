@@ -12,12 +12,15 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lab.experiments.schemes import Scheme
 from shared.planning.guidance_messages import GuidanceState
 from shared.planning.orders import Guidance
 from simulator.records.decision import Record
 from simulator.records.run_folder import naming_out
 from simulator.sites.site import Site
+from simulator.world.gain_trace import GainTrace
 
 # Part of every key: increment it when the content or the meaning of a stored flight changes.
 FORMAT = 1
@@ -115,8 +118,15 @@ def flight_key(scheme: Scheme, identity: str | None, site: Site, seed: int) -> s
         "seed": seed,
     }
     if site.gains is not None:
-        whole["gains"] = site.gains.digest()
+        whole["gains"] = _digest(site.gains)
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def _digest(gains: GainTrace) -> str:
+    found = hashlib.sha256()
+    for pair, (along, loss) in sorted(gains.points.items()):
+        found.update(np.array([*pair, len(along)], dtype=np.int64).tobytes() + along.tobytes() + loss.tobytes())
+    return found.hexdigest()
 
 
 class FlightStore:

@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from shared.kit.text_files import UnusableFile, text_of
+from shared.kit.text_files import text_of
 from shared.kit.validation_messages import problem_of
 
 log = logging.getLogger(__name__)
@@ -70,9 +70,7 @@ class KeyFile(BaseModel):
     def read(cls, path: Path) -> "KeyFile":
         """Read the file; raises ``BadKeys``."""
         try:
-            return cls.model_validate_json(text_of(path, _MAX_BYTES))
-        except UnusableFile as error:
-            raise BadKeys(str(error)) from None
+            return cls.model_validate_json(text_of(path, _MAX_BYTES, BadKeys))
         except ValidationError as error:
             fault = error.errors()[0]
             raise BadKeys(f"{path}: {'.'.join(map(str, fault['loc'])) or 'the file'}: {problem_of(fault)}") from None

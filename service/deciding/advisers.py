@@ -6,7 +6,6 @@ wrong or down and there is no plan.
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,17 +21,6 @@ from shared.world.step_rule import Action
 _VALUE_TEMPERATURE = 0.05
 # The probability that an adviser of one action spreads over all actions, so that its logarithm exists.
 SMOOTHING = 0.01
-
-
-class Preference(Protocol):
-    """An adviser's preference in one state. ``action`` is its own proposal, to be among the candidates."""
-
-    @property
-    def action(self) -> Action:
-        """The adviser's preferred sensor and velocity."""
-
-    def probabilities(self, actions: Sequence[Action]) -> FloatArray:
-        """The adviser's probabilities of the candidates, ``(n,)``, summing to 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +50,10 @@ class LearnedValues:
         scores = np.array([float(self.values[s][v]) if s in self.values else lowest for s, v in actions])
         weights = np.exp((scores - scores.max()) / _VALUE_TEMPERATURE)
         return np.asarray(weights / weights.sum())
+
+
+# An adviser's preference in one state. ``action`` is its own proposal, to be among the candidates.
+Preference = OneAction | LearnedValues
 
 
 def _by_plan(state: AttendedState) -> Preference | None:

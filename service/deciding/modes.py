@@ -5,7 +5,7 @@ import logging
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from service.deciding.rollout_evaluator import Evaluation
 from service.llm.answers import Completion, NoDecision
 from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
-from shared.wire.schemas import Mode as ModeName
+from shared.wire.schemas import Mode
 from shared.world.step_rule import Action
 
 log = logging.getLogger(__name__)
@@ -57,26 +57,15 @@ class Question:
     candidates: CandidateSet | None = None
 
 
-class Mode(Protocol):
-    """One mode of decision.
+class PolicyMode:
+    """No LLM and no learned values: the plan decides, or look-ahead if there is no plan.
+
+    The other modes ask and choose in other ways.
 
     Attributes:
         plan_share: the share of the time left that the planner may take; None if the mode needs no plan.
         plan_first: whether the plan is one of the mode's advisers, so that the state is taken after it.
     """
-
-    plan_share: ClassVar[float | None]
-    plan_first: ClassVar[bool]
-
-    def question(self, state: AttendedState, task: DecisionTask) -> Question:
-        """The prompt for this state."""
-
-    async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
-        """The mode's choice, or the reason for a fallback."""
-
-
-class PolicyMode:
-    """No LLM and no learned values: the plan decides, or look-ahead if there is no plan."""
 
     plan_share: ClassVar[float | None] = 1.0
     plan_first: ClassVar[bool] = False
@@ -233,10 +222,10 @@ def _evaluation_of(result: asyncio.Future[Evaluation]) -> Evaluation | None:
         return None
 
 
-def modes_by_name(queries: LlmQueries, evaluating: Executor) -> dict[tuple[ModeName, bool], Mode]:
+def modes_by_name(queries: LlmQueries, evaluating: Executor) -> dict[tuple[Mode, bool], PolicyMode]:
     """Every mode, by its name and by whether the mission has the compact prompt."""
     guided, value, policy = GuidedMode(queries, evaluating), ValueMode(), PolicyMode()
-    modes: dict[tuple[ModeName, bool], Mode] = {("llm", False): LlmMode(queries), ("llm", True): LetterMode(queries)}
+    modes: dict[tuple[Mode, bool], PolicyMode] = {("llm", False): LlmMode(queries), ("llm", True): LetterMode(queries)}
     for compact in (False, True):
         modes |= {("guided", compact): guided, ("value", compact): value, ("policy", compact): policy}
     return modes

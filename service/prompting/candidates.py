@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from string import ascii_uppercase
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 
@@ -69,16 +69,8 @@ class Viewpoint:
     nearest: Callable[[int, int], int] = lambda row, velocity: velocity
 
 
-class RowsWriter(Protocol):
-    """Writes the rows of the prompt."""
-
-    def __call__(self, rows: Sequence[int], letters: str, options: Sequence[Sequence[int]]) -> str:
-        """The text of a state's rows.
-
-        Args:
-            letters: each row's first choice letter.
-            options: each row's velocity options, slowest first.
-        """
+# The text of a state's rows, from the rows, each one's first choice letter, and its velocity options, slowest first.
+RowsWriter = Callable[[Sequence[int], str, Sequence[Sequence[int]]], str]
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,20 +23,16 @@ def command_main(options: type[Options], prog: str, argv: list[str], run: Callab
         options: the dataclass whose fields are the command's options and whose docstring is its ``--help``.
         prog: the command as people type it, such as ``aicvds simulate``.
         argv: the arguments after it.
-        run: the command itself; returns its exit code, and may raise the errors of :func:`run_reporting_errors`.
+        run: the command itself; returns its exit code, and its errors are printed as one line on stderr.
+            SIGTERM acts like Ctrl-C.
     """
     try:
         chosen = tyro.cli(options, prog=prog, args=argv)
     except SystemExit as done:
         return done.code if isinstance(done.code, int) else 2
-    return run_reporting_errors(prog, lambda console: run(chosen, console))
-
-
-def run_reporting_errors(prog: str, run: Callable[[Console], int]) -> int:
-    """Run a command; print its errors as one line on stderr and return an exit code. SIGTERM acts like Ctrl-C."""
     try:
         with sigterm_interrupts():
-            return run(Console())
+            return run(chosen, Console())
     except (UsageError, EdgeError, RunFailed) as error:
         print(f"{prog}: {error}{_remedy(error)}", file=sys.stderr)
         return 2 if isinstance(error, UsageError) else 1

@@ -137,7 +137,7 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
     refuse_old_result(out, options.overwrite, DECISIONS)
     own_mode = _mode_of(options.policy)
     with ExitStack() as stack:
-        edge, alive = options.edge and edge_from_option(options.edge), _no_edge
+        edge, alive = options.edge and edge_from_option(options.edge), (lambda: None)
         modes = [mode for mode in map(_mode_of, (options.policy, *options.against)) if mode is not None]
         if modes and edge is None:
             fresh_folder(out)
@@ -231,7 +231,3 @@ def _pace(given: str | None) -> float | None:
     if number is None or not float(number[1]):
         raise UsageError(f"--pace {given[:32]}: write real, or how many times faster, such as 10x")
     return float(number[1])
-
-
-def _no_edge() -> None:
-    """Nothing can have ended."""

@@ -44,38 +44,33 @@ def longest_unheard(observation: Observation, taken: frozenset[int]) -> int:
     return int(free[np.lexsort((distance, observation["last_heard"][free]))[0]])
 
 
-def best_in_reach(score: NDArray[np.float64], observation: Observation, taken: frozenset[int]) -> int:
-    """The sensor in reach with the highest score; with none in reach, the one heard longest ago.
-
-    Args:
-        score: shape ``(J,)``; of equals the lowest index wins.
-    """
-    reachable = in_reach(observation, taken)
-    if not reachable.any():
-        return longest_unheard(observation, taken)
-    return int(np.argmax(np.where(reachable, score, -np.inf)))
-
-
 class _HighestScore(ABC):
-    """Collect from the sensor in reach with the highest score; with none in reach, from the one heard longest ago."""
+    """Collect from the sensor in reach with the highest score; with none in reach, from the one heard longest ago.
+
+    Of equals the lowest index wins.
+    """
 
     def reset(self, scenario: Scenario, seed: int) -> None:
         """Start a mission; the seed is not used."""
         self._scenario = scenario
 
     @abstractmethod
-    def score(self, observation: Observation) -> FloatArray:
+    def score(self, uav: int, observation: Observation) -> FloatArray:
         """The score of every sensor, shape ``(J,)``."""
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
         """Sensor and velocity."""
-        return best_in_reach(self.score(observation), observation, taken), cruise_velocity(self._scenario)
+        score, reachable = self.score(uav, observation), in_reach(observation, taken)
+        velocity = cruise_velocity(self._scenario)
+        if not reachable.any():
+            return longest_unheard(observation, taken), velocity
+        return int(np.argmax(np.where(reachable, score, -np.inf))), velocity
 
 
 class LongestQueue(_HighestScore):
     """The sensor in reach with the longest queue: the first to overflow, if packets arrive at one rate everywhere."""
 
-    def score(self, observation: Observation) -> FloatArray:
+    def score(self, uav: int, observation: Observation) -> FloatArray:
         """The queue."""
         return observation["queue"]
 
@@ -91,7 +86,7 @@ class QueueAndChannel(_HighestScore):
         super().reset(scenario, seed)
         self._span = max(scenario.path_loss_limit_db - float(path_loss_db(0.0, scenario)), 1e-9)
 
-    def score(self, observation: Observation) -> FloatArray:
+    def score(self, uav: int, observation: Observation) -> FloatArray:
         """The weighted sum."""
         channel = np.clip((observation["channel_gain"] + self._scenario.path_loss_limit_db) / self._span, 0.0, 1.0)
         return 0.5 * observation["queue"] / self._scenario.queue_capacity + 0.5 * channel
@@ -103,7 +98,7 @@ class MaximumGain(_HighestScore):
     The gain depends only on the distance, so this is the sensor closest to the UAV, whatever its queue and its visits.
     """
 
-    def score(self, observation: Observation) -> FloatArray:
+    def score(self, uav: int, observation: Observation) -> FloatArray:
         """The channel gain."""
         return observation["channel_gain"]
 
@@ -181,24 +176,15 @@ def velocity_by_distance(distance_m: float, scenario: Scenario) -> int:
     return int(np.ceil(np.interp(distance_m, (0.0, _NEAR_M, max(scenario.radio_radius_m, _NEAR_M + 1.0)), levels)))
 
 
-class _PaperScheme(ABC):
-    """The sensor in reach with the highest priority; with none in reach, the one heard longest ago."""
+class _PaperScheme(_HighestScore):
+    """The velocity by the distance to the sensor, and each UAV for itself unless ``coordinated``."""
 
     def __init__(self, coordinated: bool = False) -> None:
         self._coordinated = coordinated
 
-    def reset(self, scenario: Scenario, seed: int) -> None:
-        """Start a mission; the seed is not used."""
-        self._scenario = scenario
-
-    @abstractmethod
-    def priority(self, uav: int, observation: Observation) -> FloatArray:
-        """The priority of every sensor, shape ``(J,)``."""
-
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
         """Sensor and velocity."""
-        known = taken if self._coordinated else frozenset()
-        sensor = best_in_reach(self.priority(uav, observation), observation, known)
+        sensor, _ = super().decide(uav, observation, taken if self._coordinated else frozenset())
         distance = np.hypot(*(observation["sensor_position"][sensor] - observation["position"]))
         return sensor, velocity_by_distance(float(distance), self._scenario)
 
@@ -217,7 +203,7 @@ class EarliestOverflowFirst(_PaperScheme):
         self._growth = np.full(shape, max(scenario.mean_arrival_rate, 1e-9))
         self._queue, self._heard = np.zeros(shape), np.full(shape, -1)
 
-    def priority(self, uav: int, observation: Observation) -> FloatArray:
+    def score(self, uav: int, observation: Observation) -> FloatArray:
         """Power gain over steps."""
         queue, heard = observation["queue"], observation["last_heard"]
         rise = (queue - self._queue[uav]) / np.maximum(heard - self._heard[uav], 1)
@@ -231,6 +217,6 @@ class EarliestOverflowFirst(_PaperScheme):
 class WeightedQueueChannel(_PaperScheme):
     """WQCS: queue times achievable rate."""
 
-    def priority(self, uav: int, observation: Observation) -> FloatArray:
+    def score(self, uav: int, observation: Observation) -> FloatArray:
         """Packets times bit/s."""
         return np.asarray(observation["queue"] * whole_rate_bps(-observation["channel_gain"], self._scenario))

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
-from typing import Protocol
 
 from pydantic import Field
 
@@ -12,6 +11,7 @@ from shared.wire.schemas import Tokens, Uplink
 from simulator.records.decision import Decision, Record, jain_index, mean, percentile, queried_llm, visits_per_sensor
 from simulator.records.operator import OperatorRecord
 from simulator.records.real_uavs import RealUavs
+from simulator.world.observation import StepTally
 
 LATE_SLACK_MS = 50.0
 
@@ -135,18 +135,7 @@ class Summary(FlightFacts):
     names: Names | None = Field(None, exclude_if=lambda value: value is None)
 
 
-class Tally(Protocol):
-    """The losses of one step; ``simulator.world.StepTally`` is one."""
-
-    @property
-    def failures(self) -> int: ...
-    @property
-    def overflows(self) -> int: ...
-    @property
-    def lost_packets(self) -> int: ...
-
-
-def summarise(flown: FlightFacts, decisions: Sequence[Decision], tallies: Mapping[str, Sequence[Tally]]) -> Summary:
+def summarise(flown: FlightFacts, decisions: Sequence[Decision], tallies: Mapping[str, Sequence[StepTally]]) -> Summary:
     """The summary of one mission.
 
     Args:
@@ -161,7 +150,7 @@ def summarise(flown: FlightFacts, decisions: Sequence[Decision], tallies: Mappin
         by_source=BySource.model_validate(Counter(d.source for d in decisions)),
         by_reason=dict(sorted(Counter(d.reason for d in decisions if d.reason is not None).items())),
         lost_packets={name: int(sum(t.lost_packets for t in tally)) for name, tally in tallies.items()},
-        loss_events={name: int(sum(t.failures + t.overflows for t in tally)) for name, tally in tallies.items()},
+        loss_events={name: int(sum(t.events for t in tally)) for name, tally in tallies.items()},
         failures=sum(d.failed for d in decisions),
         late=sum(is_late(d) for d in from_edge),
         tokens=_tokens([d.tokens for d in from_edge if d.tokens is not None]),

@@ -19,8 +19,8 @@ from matplotlib.ticker import MaxNLocator
 from shared.world.scenario import Scenario
 from shared.world.trajectory import trajectories
 from simulator.records.decision import Decision, visits_per_sensor
-from simulator.records.summary import Tally
 from simulator.reporting.figure_style import PaperFigure, paper_figure
+from simulator.world.observation import StepTally
 
 INK = "#222222"
 BLUE, ORANGE, GREEN, RED, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#767676"
@@ -196,9 +196,9 @@ def latency_per_step(decisions: Sequence[Decision]) -> PaperFigure:
     return drawn
 
 
-def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> PaperFigure:
+def losses(tallies: Mapping[str, Sequence[StepTally]], names: dict[str, str]) -> PaperFigure:
     """Lost packets and loss events of every policy, per step and cumulative; ``names`` are the policies' labels."""
-    measures: tuple[tuple[str, Callable[[Tally], int]], ...] = (
+    measures: tuple[tuple[str, Callable[[StepTally], int]], ...] = (
         ("lost packets", lambda t: t.lost_packets),
         ("loss events", lambda t: t.failures + t.overflows),
     )

@@ -18,7 +18,7 @@ from shared.world.scenario import Scenario
 from shared.world.trajectory import trajectories
 from simulator.records.decision import Decision
 from simulator.records.run_folder import FIGURES
-from simulator.records.summary import Summary, Tally
+from simulator.records.summary import Summary
 from simulator.records.track import Instant, Track
 from simulator.reporting import figures
 from simulator.reporting.figure_style import PaperFigure
@@ -34,6 +34,7 @@ from simulator.reporting.wording import (
     verdict,
     world_text,
 )
+from simulator.world.observation import StepTally
 
 # Points of all the drawn trajectories; one circle has at most 121.
 _POINTS, _POINTS_EACH = 3_000, 121
@@ -115,7 +116,7 @@ def drawings(
     summary: Summary,
     scenario: Scenario,
     decisions: Sequence[Decision],
-    tallies: Mapping[str, Sequence[Tally]],
+    tallies: Mapping[str, Sequence[StepTally]],
     sensor_xy: np.ndarray,
 ) -> dict[str, PaperFigure]:
     """The figures of this mission by their name in the page.
@@ -183,7 +184,7 @@ def write_report(
     summary: Summary,
     scenario: Scenario,
     decisions: Sequence[Decision],
-    tallies: Mapping[str, Sequence[Tally]],
+    tallies: Mapping[str, Sequence[StepTally]],
     sensor_xy: np.ndarray,
     track: Track,
 ) -> None:

@@ -10,7 +10,7 @@ from rich.table import Table
 from simulator.records.flight import Flight
 from simulator.records.real_uavs import RealUavs
 from simulator.records.run_folder import DECISIONS, FIGURES, REPORT, REQUESTS, SUMMARY, naming_out
-from simulator.records.summary import Summary, Tally
+from simulator.records.summary import Summary
 from simulator.reporting.wording import (
     bound_text,
     deciders_text,
@@ -21,10 +21,11 @@ from simulator.reporting.wording import (
     policy_labels,
     world_text,
 )
+from simulator.world.observation import StepTally
 
 
 def write_results(
-    out: Path, summary: Summary, flight: Flight, tallies: Mapping[str, Sequence[Tally]], console: Console
+    out: Path, summary: Summary, flight: Flight, tallies: Mapping[str, Sequence[StepTally]], console: Console
 ) -> None:
     """Write a flight's summary and report into the folder of its log, and print the outcome and the file names.
 

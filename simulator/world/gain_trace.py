@@ -1,6 +1,5 @@
 """A recorded gain trace: the excess loss of a UAV's links along the way that it flies."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -30,10 +29,3 @@ class GainTrace:
         for (uav, sensor), (along, loss) in self.points.items():
             excess[..., uav, sensor] = np.interp(progress_m[..., uav], along, loss, period=paths[uav].length_m)
         return excess
-
-    def digest(self) -> str:
-        """A hash of all points."""
-        found = hashlib.sha256()
-        for pair, (along, loss) in sorted(self.points.items()):
-            found.update(np.array([*pair, len(along)], dtype=np.int64).tobytes() + along.tobytes() + loss.tobytes())
-        return found.hexdigest()

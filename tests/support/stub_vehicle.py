@@ -6,14 +6,14 @@ import asyncio
 from dataclasses import replace
 
 from field.errors import VehicleError
-from field.vehicles.field_flight import Clock
+from field.vehicles.field_flight import MissionClock
 from field.vehicles.mavlink_vehicle import FlightMode, VehicleState
 from shared.world.trajectory import trajectories
 from simulator.sites.plans.mission_path import MissionItem
 from simulator.sites.site import Site
 
 
-class SimulatedClock(Clock):
+class SimulatedClock(MissionClock):
     """Moves only where it is waited for."""
 
     def __init__(self) -> None:

@@ -10,10 +10,11 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from shared.kit.text_files import text_of
 from shared.kit.validation_messages import problem_of
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
-from simulator.sites.files.reading import quoted, text_of
+from simulator.sites.files.reading import quoted
 
 MAX_BYTES = 1_000_000
 # Fields that follow from the features, and fields that only circles and drawn layouts use.
@@ -58,7 +59,7 @@ def read_overrides(path: Path) -> Overrides:
     """
     if not path.exists():
         return Overrides(path)
-    text = text_of(path, MAX_BYTES)
+    text = text_of(path, MAX_BYTES, UsageError)
     try:
         overrides = Overrides(path, text, tomllib.loads(text))
     except (ValueError, RecursionError) as error:

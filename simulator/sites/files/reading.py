@@ -1,17 +1,4 @@
-"""Reading one of a world's files, of a bounded size."""
-
-from pathlib import Path
-
-from shared.kit import text_files
-from simulator.errors import UsageError
-
-
-def text_of(path: Path, max_bytes: int) -> str:
-    """:func:`shared.kit.text_files.text_of`; raises ``UsageError``."""
-    try:
-        return text_files.text_of(path, max_bytes)
-    except text_files.UnusableFile as error:
-        raise UsageError(str(error)) from None
+"""Messages about a world's files."""
 
 
 def quoted(value: object) -> str:

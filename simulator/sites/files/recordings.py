@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from shared.kit.text_files import text_of
 from shared.world.channel import IntArray
 from simulator.errors import UsageError
-from simulator.sites.files.reading import quoted, text_of
+from simulator.sites.files.reading import quoted
 
 # The world takes a second to import, and commands answer bad use without it.
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def read_trace(path: Path, sensors: Sequence[str]) -> IntArray:
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
     """The header and each line that is not blank: the file and the line's number for messages, and the cells."""
-    rows = csv.reader(io.StringIO(text_of(path, MAX_BYTES), newline=""), strict=True)
+    rows = csv.reader(io.StringIO(text_of(path, MAX_BYTES, UsageError), newline=""), strict=True)
     try:
         header = [cell.strip() for cell in next(rows, [])]
         yield f"{path}, line 1", header

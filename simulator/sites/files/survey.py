@@ -9,12 +9,13 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails, from_json
 
+from shared.kit.text_files import text_of
 from shared.kit.validation_messages import problem_of
 from shared.wire.names import MAX_NAME
 from shared.world.scenario import MAX_SENSORS, Point
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence, FenceRole
-from simulator.sites.files.reading import json_fault, quoted, text_of
+from simulator.sites.files.reading import json_fault, quoted
 
 MAX_BYTES = 20_000_000
 MAX_TRAJECTORIES, MAX_WAYPOINTS, MAX_FENCES, MAX_CORNERS = 100, 1000, 100, 1000
@@ -228,7 +229,7 @@ def _features(path: Path, features: Sequence[Any]) -> Iterator[tuple[str, _Featu
 
 def read_collection(path: Path) -> dict[str, Any]:
     """The feature collection in a file, its features not looked at; raises as :func:`read_survey`."""
-    text = text_of(path, MAX_BYTES)
+    text = text_of(path, MAX_BYTES, UsageError)
     try:
         # NaN and infinities pass here; the validation of their feature rejects them with its label.
         document = from_json(text)

@@ -13,11 +13,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from shared.kit.text_files import text_of
 from shared.kit.validation_messages import problem_of
 from shared.world.scenario import Point
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence
-from simulator.sites.files.reading import json_fault, quoted, text_of
+from simulator.sites.files.reading import json_fault, quoted
 from simulator.sites.files.survey import MAX_WAYPOINTS
 from simulator.sites.plans.mission_path import (
     LAND,
@@ -145,7 +146,7 @@ def read_plan(path: Path) -> FlightPlan:
     """
     if path.suffix.lower() in (".kml", ".kmz"):
         raise UsageError(f"{path} is no flight plan, but a map; {_REMEDY}")
-    text = text_of(path, MAX_BYTES)
+    text = text_of(path, MAX_BYTES, UsageError)
     try:
         if text.startswith("QGC WPL"):
             plan, items, notes = _Plan(fileType="Plan", mission=_Mission(items=[])), *_text_items(text)
