@@ -124,9 +124,9 @@ def _propose(
 
 
 @inlined
-def _velocity(tables: Tables, now: int) -> int:
-    """Draw an allowed velocity: a near one, the highest, or any."""
-    count, kind = len(tables.velocities), np.random.random()
+def _velocity(tables: Tables, uav: int, now: int) -> int:
+    """Draw an allowed velocity that the UAV reaches: a near one, the highest, or any."""
+    count, kind = tables.speeds[uav], np.random.random()
     if kind < _ANY_VELOCITY:
         return int(tables.velocities[_below(count)])
     if kind < _HIGHEST_VELOCITY:
@@ -144,7 +144,7 @@ def _propose_velocity(
     tables: Tables, current: CurrentPlan, new: Proposal, step: int, uav: int, temperature: float, kind: float
 ) -> bool:
     """Draw another velocity of a UAV: for one step, with the opposite change at a later one, or for some steps."""
-    steps, drawn = len(current.sensor), _velocity(tables, current.velocity[step, uav])
+    steps, drawn = len(current.sensor), _velocity(tables, uav, current.velocity[step, uav])
     more = drawn - current.velocity[step, uav]
     new.velocity[step, uav] = drawn
     if kind < _RUN:
@@ -158,8 +158,8 @@ def _propose_velocity(
         then = step + 1 + _below(steps - step - 1)
         new.velocity[then, uav] -= more
         allowed = False
-        for velocity in tables.velocities:
-            allowed = allowed or velocity == new.velocity[then, uav]
+        for level in range(tables.speeds[uav]):
+            allowed = allowed or tables.velocities[level] == new.velocity[then, uav]
         if not allowed:
             return False
     nowhere, place = len(tables.start) - 1, current.place[step, uav] - current.velocity[step, uav]

@@ -41,7 +41,7 @@ class Tables(NamedTuple):
         ends: shape ``(K, J, Q)``, those after the horizon, by stage.
         stages: shape ``(U, C, J)``; the lowest of all UAVs counts.
         usable: shape ``(H, J)``.
-        velocities: shape ``(V,)``, those allowed, rising.
+        velocities: shape ``(V,)``, those allowed, rising; ``speeds``, shape ``(U,)``, the number that each UAV reaches.
         fixed: shape ``(U,)``, the number of each UAV's first actions that stay.
         reached: shape ``(U, 1 or H, C, R)``, the sensors in reach, and after them -1.
         late: shape ``(H + 1, H + 1, J)``, or empty.
@@ -60,6 +60,7 @@ class Tables(NamedTuple):
     stages: IntArray
     usable: NDArray[np.bool_]
     velocities: IntArray
+    speeds: IntArray
     fixed: IntArray
     reached: IntArray
     late: Floats
@@ -92,6 +93,7 @@ class Tables(NamedTuple):
             stages=no_stages if problem.stages is None else np.stack(problem.stages),
             usable=everywhere if problem.usable is None else problem.usable,
             velocities=problem.levels,
+            speeds=problem.reached,
             fixed=np.array([len(problem.fixed.get(uav, ())) for uav in range(problem.uavs)]),
             reached=listed(moved > 0),
             late=late.astype(np.float32),

@@ -31,6 +31,8 @@ class FleetProblem:
             obey it.
         allowed: shape ``(V,)``, whether a plan may fly each velocity 0..V - 1; ``None``: all. Fixed actions need not
             obey it.
+        tops: shape ``(I,)``, the highest velocity that each UAV reaches; ``None``: all that are allowed. Of a UAV that
+            reaches none of these, a plan flies the lowest.
         weights: shape ``(J,)``, the factor of each sensor's lost packets; ``None``: 1.
         late: shape ``(H + 1, H + 1, J)``: ``late[s, e]`` is the price in packets, beside its losses, of each sensor's
             lateness in step e (H stands for all later steps) if no UAV has visited it since step s began; s = 0 means
@@ -59,6 +61,7 @@ class FleetProblem:
     fixed: Mapping[int, IntArray] = field(default_factory=dict)
     usable: NDArray[np.bool_] | None = None
     allowed: NDArray[np.bool_] | None = None
+    tops: IntArray | None = None
     weights: FloatArray | None = None
     late: FloatArray | None = None
     links: Sequence[IntArray] | None = None
@@ -78,6 +81,7 @@ class FleetProblem:
             "arrivals": (steps, count),
             "usable": (steps, count),
             "allowed": (levels,),
+            "tops": (self.uavs,),
             "weights": (count,),
             "late": (steps + 1, steps + 1, count),
         }
@@ -138,6 +142,14 @@ class FleetProblem:
         """The velocities that a plan may fly, slowest first."""
         every = np.arange(self.scenario.max_velocity + 1)
         return every if self.allowed is None else every[self.allowed]
+
+    @property
+    def reached(self) -> IntArray:
+        """The number of these velocities that each UAV reaches, at least 1, ``(I,)``."""
+        levels = self.levels
+        if self.tops is None:
+            return np.full(self.uavs, len(levels))
+        return np.maximum(levels.searchsorted(self.tops, side="right"), 1)
 
     def distance(self, uav: int, velocity: IntArray) -> FloatArray:
         """Horizontal distances to all sensors, metres, ``(..., J)``, after steps whose velocities sum to ``(...)``."""
@@ -219,6 +231,7 @@ def with_fixed(problem: FleetProblem, actions: IntArray) -> IntArray:
     """The actions with the fixed ones at the beginning; the nearest allowed velocity replaces a forbidden one."""
     start = actions.copy()
     start[:, :, 1] = problem.levels[np.abs(start[:, :, 1, None] - problem.levels).argmin(axis=-1)]
+    start[:, :, 1] = np.minimum(start[:, :, 1], problem.levels[problem.reached - 1])
     for uav, fixed in problem.fixed.items():
         start[: len(fixed), uav] = fixed
     return start

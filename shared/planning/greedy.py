@@ -28,7 +28,7 @@ def look_ahead(problem: FleetProblem) -> IntArray:
     flown = np.zeros(problem.uavs, dtype=np.int64)
     queue: FloatArray = problem.queue.astype(np.float64)
     since = np.zeros(problem.sensors, dtype=np.int64)
-    every = np.arange(problem.sensors)
+    every, reached = np.arange(problem.sensors), problem.reached
     for step in range(problem.horizon):
         overflow = _overflow(queue, problem.arrivals[step : step + window].mean(axis=0), world)
         urgent = urgency_of(queue, overflow, world)
@@ -44,11 +44,12 @@ def look_ahead(problem: FleetProblem) -> IntArray:
                 sensor, velocity = fixed_now[uav].tolist()
                 packets = _expected(problem, uav, flown[uav] + np.array([velocity]), step)[0]
             else:
-                links = _expected(problem, uav, flown[uav] + problem.levels, step)
+                levels = problem.levels[: reached[uav]]
+                links = _expected(problem, uav, flown[uav] + levels, step)
                 worth = urgent * np.minimum(queue, links) + (0.0 if late is None else late * (links > 0))
-                worth = with_bonus(np.where(free, worth, -1.0), problem.levels)
+                worth = with_bonus(np.where(free, worth, -1.0), levels)
                 level, sensor = np.unravel_index(int(worth.argmax()), worth.shape)
-                velocity, packets = int(problem.levels[level]), links[level]
+                velocity, packets = int(levels[level]), links[level]
                 free[sensor] = False
             actions[step, uav] = sensor, velocity
             flown[uav] += velocity

@@ -13,6 +13,10 @@ Floats = NDArray[np.float32]
 # larger capacity a level is several packets. With 60 levels, one a packet, missions in six development worlds of
 # `shadowed` and `faulty` lost the same packets.
 _MOST_LEVELS = 30
+# The levels are those of the queue's upper end: at least so many packets, and this factor times what arrives in the
+# steps that count, so many standard deviations above the mean. With levels of whole queues of 2,000 packets, a visit
+# that moves six packets counted as one of 67.
+_LEAST_TOP, _SPARE, _DEVIATIONS = 60, 1.5, 4.0
 # A negative binomial with this many successes is a Poisson distribution.
 _POISSON = 1e9
 # The places of a uniform distribution's quantiles, for a queue without a beacon.
@@ -21,7 +25,9 @@ _QUANTILES = np.linspace(-1.0, 1.0, 9)
 
 @dataclass(frozen=True, eq=False)
 class QueueChains:
-    """The Markov chains of J sensors' queues over a horizon of H steps, on G + 1 levels from 0 packets to W.
+    """The Markov chains of J sensors' queues over a horizon of H steps, on G + 1 levels up to W packets.
+
+    The lowest level stands for all queues that no arrivals fill within the steps that count.
 
     Attributes:
         level: packets of a level.
@@ -70,6 +76,12 @@ def queue_chains(
         best_chance: the share, ``(J,)``, of the losses beyond the first stage's that count.
         weights: the factor of each sensor's lost packets, ``(J,)``.
     """
+    most = coming.mean.sum(axis=0) + later.mean[-1]
+    most += _DEVIATIONS * np.sqrt(coming.variance.sum(axis=0) + later.variance[-1])
+    low = base - capacity
+    capacity = int(min(capacity, max(_LEAST_TOP, np.ceil(_SPARE * most.max(initial=0.0)))))
+    low += capacity
+    base, came = np.maximum(low, 0.0), Arriving(np.maximum(came.mean + np.minimum(low, 0.0), 0.0), came.variance)
     count = min(capacity, _MOST_LEVELS)
     level = capacity / count
     came_by, _ = _by_level(came, capacity, count)

@@ -221,6 +221,7 @@ class RecedingHorizon:
             **links,
             **self._outlook(kept, horizon),
             **self._guided(kept, horizon, free),
+            tops=np.array([belief.drift.fastest([u], world.max_velocity) for u in present]),
         )
         before = np.empty((horizon, len(present), 2), dtype=np.int64)
         before[:] = nowhere, problem.levels[-1]
@@ -346,7 +347,7 @@ class RecedingHorizon:
         rate, dispersion, base = arrivals.rate[kept], arrivals.dispersion, belief.base[kept]
         rate_variance = rate / arrivals.watched[kept]
         age = np.maximum(step - belief.since[kept], 0)
-        came = np.maximum(belief.queue(step)[kept] - base, 0.0) * (age > 0)
+        came = arrivals.since(belief.since[kept], step, kept)
         soon = np.diff(Arrivals.burst_over(np.arange(horizon + 1)), axis=0)
         coming = rate + arrivals.burst(step)[kept] * soon[:, None]
         beyond = np.array(self._beyond(horizon))[:, None]
@@ -385,8 +386,7 @@ class RecedingHorizon:
 
     def _guided(self, kept: IntArray, horizon: int, free: list[int]) -> dict[str, Any]:
         """The part of the problem that the guidance and these UAVs' top speeds make, with one sensor nowhere."""
-        orders: dict[str, Any] = {}
-        world, step = self._scenario, self.step
+        orders, world, step = dict[str, Any](), self._scenario, self.step
         fastest = self._belief.drift.fastest(free, world.max_velocity)
         if self.guidance.restricts or fastest < world.max_velocity:
             allowed = self.guidance.allowed(world.max_velocity + 1)

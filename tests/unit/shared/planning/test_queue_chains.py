@@ -77,3 +77,16 @@ def test_an_unheard_queue_is_spread_around_its_mean() -> None:
     mean = float(made.start[0] @ levels)
     assert mean == pytest.approx(30.0, abs=0.1)
     assert float(made.start[0] @ (levels - mean) ** 2) == pytest.approx(12.0**2, rel=0.3)
+
+
+@pytest.mark.parametrize(("capacity", "room"), [(250, 12.0), (2_000, 12.0), (2_000, 30.0), (100_000, 12.0)])
+def test_a_large_queue_is_as_fine_at_its_upper_end(capacity: int, room: float) -> None:
+    made = chains(capacity - room, 5.0, 5.0, capacity)
+    assert made.level < 4
+    odds, lost = made.start[0], []
+    for step in range(3):
+        lost.append(float(odds @ made.lost[step, 0]))
+        odds = odds @ transitions(made.arrive[step, 0])
+    np.testing.assert_allclose(lost, simulated(capacity - room, 5.0, 0.0, capacity, 3), rtol=0.1, atol=0.25)
+    # Far from full nothing is lost, and what came since the beacon fills what lies below the levels first.
+    assert chains(capacity / 3, 5.0, 5.0, capacity).start[0, 0] == pytest.approx(1.0)

@@ -153,3 +153,26 @@ def test_in_a_larger_fleet_a_plan_chooses_the_actions_of_the_nearest_and_knows_t
 def test_uavs_that_need_a_decision_are_all_in_their_plan() -> None:
     draft = fleet(20, 300.0).draft([0, 19])
     assert draft is not None and {0, 1, 18, 19} <= set(draft.free)
+
+
+def test_no_plan_flies_a_slow_uav_at_a_faster_ones_speed() -> None:
+    horizon = heard(58.0)
+    horizon._belief.drift.tops = {0: 5}
+    fastest = planned(horizon).actions[:, :, 1].max(axis=0)
+    assert fastest[0] <= 5 < fastest[1:].max()
+
+
+def test_a_queue_that_nobody_looks_at_grows_ever_more_certainly_full() -> None:
+    full = []
+    for step in (5, 10, 15, 20):
+        horizon = RecedingHorizon(scenario_named("paper"), FleetBelief(scenario_named("paper")))
+        belief = horizon._belief
+        belief.hear(SENSORS, belief.trajectory(0).at(SENSORS * 40.0), 0 * SENSORS, np.full(10, 30.0), np.full(10, 50.0))
+        belief.locate(0, step, belief.trajectory(0).at(0.0).tolist(), 0.0)
+        horizon.begin(step)
+        draft = horizon.draft([0])
+        assert draft is not None and draft.problem.chains is not None
+        full.append(float(draft.problem.chains.start[0, -1]))
+    assert full == sorted(full)
+    # 20 steps at five packets a step, where the rate may be lower.
+    assert full[-1] > 0.9
