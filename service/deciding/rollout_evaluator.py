@@ -25,7 +25,7 @@ from shared.planning.orders import LATE_PACKETS
 from shared.world.channel import FloatArray
 from shared.world.scenario import SCENARIOS
 from shared.world.step_rule import Action
-from shared.world.urgency import VELOCITY_BONUS, urgency
+from shared.world.urgency import VELOCITY_BONUS, urgency_by_level
 
 # Sampled futures. All candidates are flown through the same ones, so that arrivals cause no difference between them. On
 # 8 worlds of scenario `paper`, flying the best candidate of an earlier evaluator lost 38 packets with 8 futures, 33
@@ -76,7 +76,6 @@ class FlownWorld(NamedTuple):
         scenario, guidance, uavs = state.scenario, state.guidance, list(state.links)
         fast = np.arange(scenario.max_velocity + 1, dtype=np.float64)
         weights = guidance.weights(scenario.sensors)[state.sensors]
-        levels = np.arange(scenario.queue_capacity + 1, dtype=np.float64)[:, None]
         packets, margins, holds = (_stacked(tables) for tables in (state.links, state.margins, state.holds))
         bonus = np.where(guidance.allowed(len(fast)), VELOCITY_BONUS * fast, -np.inf)
         return cls(
@@ -84,7 +83,7 @@ class FlownWorld(NamedTuple):
             margins=margins,
             holds=holds,
             offered=_offered(packets),
-            urgency=np.ascontiguousarray(urgency(levels, state.rates, scenario) * weights),
+            urgency=np.ascontiguousarray(urgency_by_level(state.rates, scenario) * weights),
             bonus=bonus,
             highest_bonus=np.asarray(bonus.max()),
             weights=weights,

@@ -48,6 +48,33 @@ def above_poisson(room: FloatArray, mean: FloatArray, above: FloatArray) -> None
         above[i] = min(max(1.0 - total, 0.0), 1.0)
 
 
+@compiled
+def _above_by_level(mean: FloatArray, above: FloatArray) -> None:
+    """Write ``P(Poisson(mean) > W - q)`` for q of 0 to W packets, ``(W + 1, n)``, as :func:`above_poisson` sums it."""
+    capacity = above.shape[0] - 1
+    for i in range(len(mean)):
+        most, small = int(min(capacity, mean[i] + 12.0 * math.sqrt(mean[i]) + 40.0)), mean[i] < _SMALL_MEAN
+        probability, logarithm = math.exp(-mean[i]) if small else 0.0, -mean[i]
+        total = probability
+        for packets in range(capacity + 1):
+            if 0 < packets <= most:
+                if small:
+                    probability *= mean[i] / packets
+                else:
+                    logarithm += math.log(mean[i] / packets)
+                    probability = math.exp(logarithm)
+                total += probability
+            above[capacity - packets, i] = min(max(1.0 - total, 0.0), 1.0)
+
+
+def urgency_by_level(rate: FloatArray, scenario: Scenario) -> FloatArray:
+    """:func:`urgency` of queues of 0 to W packets with arrivals at rates ``(n,)``, shape ``(W + 1, n)``."""
+    levels = np.arange(scenario.queue_capacity + 1, dtype=np.float64)[:, None]
+    above = np.empty((len(levels), len(rate)))
+    _above_by_level(rate * scenario.overflow_horizon_steps, above)
+    return urgency_of(levels, above, scenario)
+
+
 def with_bonus(worth: FloatArray, velocities: NDArray[np.int64]) -> FloatArray:
     """Add to the worth ``(V, J)`` of urgent packets, in place, that of the velocities ``(V,)``."""
     worth += VELOCITY_BONUS * velocities[:, None]
