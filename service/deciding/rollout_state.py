@@ -31,6 +31,7 @@ class RolloutState:
         queue: shape ``(n,)``, the last known packets.
         unknown: shape ``(n,)``, whether the queue is unknown and is sampled as the world samples it.
         age: shape ``(n,)``, steps since the queue was known.
+        burst_before: shape ``(n,)``, packets above the rate that are expected to have come since then.
         arrived, watched: shape ``(n,)``, shape and rate of the Gamma belief of the packets a step.
         dispersion: the variance of the packets of a step over a Poisson's.
         bursts: shape ``(horizon, n)``, packets above the rate that are expected in each step.
@@ -55,6 +56,7 @@ class RolloutState:
     queue: FloatArray
     unknown: NDArray[np.bool_]
     age: NDArray[np.int64]
+    burst_before: FloatArray
     arrived: FloatArray
     watched: FloatArray
     dispersion: float
@@ -113,6 +115,8 @@ class RolloutState:
             queue=queue[sensors],
             unknown=unknown[sensors],
             age=age[sensors],
+            burst_before=belief.arrivals.since(step - age[sensors], step, sensors)
+            - belief.arrivals.rate[sensors] * age[sensors],
             arrived=belief.arrivals.arrived[sensors],
             watched=belief.arrivals.watched[sensors],
             dispersion=belief.arrivals.dispersion,
@@ -141,9 +145,9 @@ def _after(
     visited = belief.visited.copy()
     for sensor, link in moved:
         queue[sensor] = max(0.0, float(belief.queue(step)[sensor] - link))
-        age[sensor], unknown[sensor] = 0, False
+        age[sensor] = 0
         if link > 0:
-            visited[sensor] = step
+            visited[sensor], unknown[sensor] = step, False
     return queue, age, unknown, visited
 
 
@@ -184,7 +188,7 @@ class SampledFutures:
         rates = random.gamma(state.arrived, 1.0 / state.watched, shape)
         fewest, most = scenario.initial_queue_min * capacity, scenario.initial_queue_max * capacity
         drawn = random.uniform(fewest, most, shape)
-        start = np.where(state.unknown, drawn, state.queue) + random.poisson(rates * state.age)
+        start = np.where(state.unknown, drawn, state.queue) + random.poisson(rates * state.age + state.burst_before)
         expected = rates
         if state.dispersion > 1.0:
             # A Poisson number of a Gamma mean has a variance above its mean.

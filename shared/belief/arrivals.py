@@ -146,7 +146,8 @@ def take_beacons(
     count = 0
     for n in range(ids.shape[0]):
         sensor, step, queue = ids[n], beacon_step[n], beacon_queue[n]
-        if step <= heard[sensor]:
+        # The queue of a step before the visit from which it is known says less than that visit.
+        if step <= heard[sensor] or step <= visited[sensor] == since[sensor]:
             continue
         passed = step - since[sensor]
         if heard[sensor] >= 0 and passed > 0 and queue < capacity:

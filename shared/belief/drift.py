@@ -54,9 +54,9 @@ class Drift:
         # An airframe with a top speed needs some way to slow down, so that a short one says nothing of the wind.
         if still_m <= (_BRAKING_M if self.tops else 0.0):
             return
-        # Progress may restart with every lap, and shakes where a UAV hovers.
-        ways = (end_m - start_m + laps * path.length_m for laps in (-1, 0, 1))
-        flown_m = min(ways, key=lambda way_m: abs(way_m - still_m))
+        # Progress may restart with every lap, of which a long step has several, and shakes where a UAV hovers.
+        flown_m = end_m - start_m
+        flown_m += round((still_m - flown_m) / path.length_m) * path.length_m
         share = min(max(flown_m / still_m, 0.0), _FASTEST) - 1.0
         if self.none and abs(share) <= _NOTHING:
             return

@@ -137,8 +137,8 @@ class FleetBelief:
 
     @property
     def base_variance(self) -> FloatArray:
-        """The variance of ``base``, shape ``(J,)``: 0 for a sensor that was heard, or read before the first step."""
-        return np.where((self.heard < 0) & (self.since >= 0), self._drawn_variance, 0.0)
+        """The variance of ``base``, shape ``(J,)``: 0 for a sensor heard, visited, or read before the first step."""
+        return np.where((self.heard < 0) & (self.visited < 0) & (self.since >= 0), self._drawn_variance, 0.0)
 
     def hear(self, ids: IntArray, places: FloatArray, beacon: IntArray, queue: FloatArray, battery: FloatArray) -> None:
         """Add the beacons that are newer than the known ones.

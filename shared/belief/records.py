@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.belief.fleet_belief import FleetBelief, Measured
+from shared.belief.fleet_belief import NOTHING_MEASURED, FleetBelief, Measured
 from shared.wire.schemas import UavState
 from shared.wire.sensor_arrays import arrays_of
 from shared.world.channel import FloatArray
@@ -13,6 +13,8 @@ from shared.world.scenario import Scenario
 
 # The weight, in steps, of the scenario's mean arrival rate against the observations.
 _PRIOR_STEPS = 2.0
+# Of a UAV whose steps go back further, another flight begins.
+_LATE_STEPS = 3
 NEVER = -1
 
 
@@ -131,14 +133,21 @@ def take_readings(
 
 
 def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief) -> Measured:
-    """Add a UAV's full report to the sensors' records and to the belief; returns the measurements of its gains."""
-    reported = arrays_of(uav.sensors)
+    """Add a UAV's full report to the sensors' records and to the belief; returns the measurements of its gains.
+
+    A report that was delayed, behind a later one of the UAV, has only beacons: its place would undo the later decision.
+    """
+    reported, last = arrays_of(uav.sensors), belief.uavs.get(uav.uav_id)
+    delayed = last is not None and step < last.taught <= step + _LATE_STEPS
     belief.advance(step)
-    belief.locate(uav.uav_id, step, uav.position, uav.progress_m)
+    if not delayed:
+        belief.locate(uav.uav_id, step, uav.position, uav.progress_m)
     if uav.top_speed_mps is not None:
         belief.drift.tops[uav.uav_id] = max(1, round(uav.top_speed_mps))
     belief.hear(reported.ids, reported.places, reported.beacon, reported.queue, reported.battery)
     fresh = reported.beacon == step
-    measured = belief.measure(uav.uav_id, reported.ids[fresh], reported.gain[fresh])
+    measured = NOTHING_MEASURED
+    if not delayed:
+        measured = belief.measure(uav.uav_id, reported.ids[fresh], reported.gain[fresh])
     records.hear(reported.ids, reported.beacon, reported.queue)
     return measured

@@ -51,6 +51,7 @@ def state_of(seed: int, guidance: Guidance, *, uncertain: bool, planned: bool) -
         queue=queue,
         unknown=unknown,
         age=age,
+        burst_before=np.zeros(SENSORS),
         arrived=arrived,
         watched=np.full(SENSORS, 4.0),
         dispersion=1.0 if seed % 2 else 2.5,

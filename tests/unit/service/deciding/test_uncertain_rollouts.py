@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.deciding.rollout_evaluator import evaluate
-from service.deciding.rollout_state import RolloutState
+from service.deciding.rollout_state import RolloutState, SampledFutures
 from shared.belief.fleet_belief import FleetBelief
 from shared.world.channel import FloatArray, channel_gain_db
 from shared.world.scenario import SCENARIOS
@@ -78,3 +78,34 @@ def test_the_same_state_is_judged_the_same_to_the_bit() -> None:
     fleet.channel.failures.settle(1, failed=True)
     again.load_state_dict(fleet.state_dict())
     np.testing.assert_array_equal(lost(fleet), lost(again))
+
+
+def test_rollouts_begin_with_what_a_burst_brought_since_the_last_beacon() -> None:
+    world = SCENARIOS["bursty"].model_copy(update={"queue_capacity": 200})
+    fleet = FleetBelief(world)
+    here = fleet.trajectory(0).at(0.0)
+    fleet.locate(0, 0, here.tolist(), 0.0)
+    queue = 0.0
+    for step in range(31):
+        fleet.hear(np.array([0]), here[None], np.array([step]), np.array([queue]), np.array([50.0]))
+        queue += 20.0 if step >= 27 else 3.0
+    assert fleet.arrivals.in_bursts
+    for step in (30, 31, 32, 34):
+        fleet.uavs[0].step = step
+        state = RolloutState.of(fleet, world, step, 0)
+        row = state.sensors.tolist().index(0)
+        start = SampledFutures.of(state, 4000).start[:, row].mean()
+        assert start == pytest.approx(fleet.queue(step)[0], abs=1.0)
+
+
+def test_rollouts_know_that_an_unheard_sensor_was_emptied_in_the_step_before() -> None:
+    fleet = FleetBelief(PAPER)
+    here = fleet.trajectory(2).at(0.0).tolist()
+    fleet.places[3] = here
+    fleet.locate(2, 0, here, 0.0)
+    fleet.record_decision(2, 0, 3, 0)
+    fleet.advance(1)
+    fleet.locate(2, 1, here, 0.0)
+    state = RolloutState.of(fleet, PAPER, 1, 2)
+    row = state.sensors.tolist().index(3)
+    assert SampledFutures.of(state, 2000).start[:, row].mean() == pytest.approx(fleet.queue(1)[3], abs=0.5)

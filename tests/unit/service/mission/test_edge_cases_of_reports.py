@@ -184,3 +184,25 @@ def test_an_experience_of_a_sensor_never_heard_has_no_numbers() -> None:
     state = AttendedState.of(mission, report, 0)
     seen = [state.pending(f"{sensor:032x}", Action(sensor, 7)).seen for sensor in (0, 1)]
     assert (seen[0]["queue"], seen[1]["queue"], seen[1]["battery"]) == ("50", "?", "?")
+
+
+def test_a_delayed_report_does_not_undo_a_later_decision() -> None:
+    mission = _mission(_world(uavs=2))
+
+    def decided(step: int, decision_id: str, sensor: int) -> None:
+        attempt = mission.observe(_report(0, step, [50.0 - step, 20.0], [50.0] * 2), step)
+        mission.commit(Pending(decision_id * 32, 0, step, sensor, 3, {"queue": "1", "age": "0"}, None), attempt)
+
+    decided(5, "a", 0)
+    decided(4, "b", 1)
+    assert mission.belief.decided(5) == {0: (0, 3)}
+    mission.observe(_report(1, 6, [0.0, 25.0], [50.0] * 2), 6)
+    assert mission.belief.uavs[0].step == 6 and mission.belief.visited.tolist() == [5, -1]
+
+
+def test_a_step_that_is_asked_again_after_the_fleet_went_on_is_decided_anew() -> None:
+    mission = _mission(_world(uavs=2))
+    for uav, step, sensor, decision_id in ((0, 5, 0, "a"), (1, 6, 1, "b"), (0, 5, 1, "c")):
+        attempt = mission.observe(_report(uav, step, [50.0, 20.0], [50.0] * 2), step)
+        mission.commit(Pending(decision_id * 32, uav, step, sensor, 3, {"queue": "1", "age": "0"}, None), attempt)
+    assert mission.belief.decided(5) == {0: (1, 3)}

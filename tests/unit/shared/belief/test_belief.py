@@ -159,3 +159,30 @@ def test_a_world_in_which_nothing_arrives_is_known_to_be_one(most: float) -> Non
     np.testing.assert_allclose(fleet.arrivals.rate, 0.0, atol=1e-12)
     np.testing.assert_allclose(fleet.queue(1_000_000), [10.0, 58.0])
     assert np.isfinite(np.random.default_rng(0).gamma(fleet.arrivals.arrived, 1.0 / fleet.arrivals.watched)).all()
+
+
+def test_an_unheard_queue_is_known_after_a_visit_unless_that_failed() -> None:
+    fleet = FleetBelief(Scenario(name="one", sensors=1, uavs=1))
+    here = fleet.trajectory(0).at(0.0).tolist()
+    fleet.places[0] = here
+    fleet.locate(0, 0, here, 0.0)
+    fleet.record_decision(0, 0, 0, 0)
+    fleet.advance(1)
+    assert fleet.visited[0] == 0 and fleet.base_variance[0] == 0
+    fleet.settle(0, 0, failed=True)
+    assert fleet.visited[0] == -1 and fleet.base_variance[0] > 0
+
+
+@pytest.mark.parametrize("beacon", [3, 4, 5])
+def test_a_beacon_from_before_a_visit_does_not_undo_it(beacon: int) -> None:
+    fleet = belief()
+    here = fleet.trajectory(0).at(0.0).tolist()
+    fleet.hear(np.array([0]), np.array([here]), np.array([2]), np.array([40.0]), np.array([40.0]))
+    fleet.locate(0, 5, here, 0.0)
+    fleet.record_decision(0, 5, 0, 0)
+    fleet.advance(6)
+    after = fleet.queue(6)[0]
+    fleet.hear(np.array([0]), np.array([here]), np.array([beacon]), np.array([50.0]), np.array([40.0]))
+    assert fleet.queue(6)[0] == after < 10
+    fleet.hear(np.array([0]), np.array([here]), np.array([6]), np.array([50.0]), np.array([40.0]))
+    assert fleet.queue(6)[0] == 50

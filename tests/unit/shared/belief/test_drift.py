@@ -97,3 +97,11 @@ def test_a_way_of_a_whole_flight_is_as_the_sum_of_its_parts() -> None:
     for _ in range(60):
         end += float(drift.flown(LAP, end, np.array([whole / 60]))[0])
     assert float(drift.flown(LAP, 100.0, np.array([whole]))[0]) == pytest.approx(end - 100.0, rel=0.01)
+
+
+@pytest.mark.parametrize("laps", [0.3, 1.0, 2.3, 5.0])
+def test_still_air_is_no_wind_however_many_laps_a_step_has(laps: float) -> None:
+    drift, way = Drift(), laps * LAP.length_m
+    for step in range(10):
+        drift.learn(LAP, step * way % LAP.length_m, way, (step + 1) * way % LAP.length_m)
+    assert drift.none
