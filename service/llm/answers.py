@@ -17,7 +17,10 @@ class NoDecision(Exception):
 
     Attributes:
         reason: for the response and the metrics; ``str()`` has the details.
+        url: of the server that gave none; empty for the embedded LLM, and where none was called.
     """
+
+    url = ""
 
     def __init__(self, reason: Reason, detail: str) -> None:
         super().__init__(detail)

@@ -226,11 +226,11 @@ class LlmServer:
         try:
             with self._priority.decision():
                 answer = await self._complete(partial(self.connection.complete, body, mission_id))
-        except (NotUnderstood, Busy):
-            # The fault is the request's, or will be over by itself.
-            raise
         except NoDecision as error:
-            self._failed(error.reason, f" ({error})")
+            error.url = self.url
+            # Of the others the fault is the request's, or will be over by itself.
+            if not isinstance(error, NotUnderstood | Busy):
+                self._failed(error.reason, f" ({error})")
             raise
         except asyncio.CancelledError as cancelled:
             if silence is None or EARLIER_CALL_ANSWERED in cancelled.args:

@@ -101,6 +101,7 @@ class ServerPool:
 
     def record_usability(self, mission_id: str, fault: NoDecision | None, url: str | None = None) -> None:
         """Record whether the answer of the server ``url`` could be used; ``fault`` is the reason why not."""
+        url = url or (fault.url if fault else None)
         server = next((one for one in self._each if url and one.url == url), self.serving(mission_id))
         if fault is None:
             server.usability.usable()

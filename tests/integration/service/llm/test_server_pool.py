@@ -197,3 +197,28 @@ def test_unusable_answers_count_against_the_server_that_gave_them(edge: Edge, re
         assert "answer_format" in reasons
         ready = client.get("/readyz").json()
         assert ready["model"] == "first" and ready["llm"] == "ready", ready
+
+
+def test_a_refused_request_counts_against_the_server_that_refuses_it(edge: Edge, report: Report) -> None:
+    """The first server asks for a pause, and the second, asked in its place, understands no request."""
+
+    class Refusing(Named):
+        def __init__(self, name: str, status: int, **headers: str) -> None:
+            super().__init__(name, "0 7")
+            self.status, self.headers = status, headers
+
+        async def respond(self, body: dict[str, Any], probed: bool) -> Response:
+            if probed or body["messages"][-1]["content"] == FIRST:
+                return await super().respond(body, probed)
+            return Response(b"{}", self.status, self.headers)
+
+    with (
+        serving(Refusing("first", 429, **{"retry-after": "300"}).app) as first,
+        serving(Refusing("second", 400).app) as second,
+    ):
+        client = edge(mode="llm", llm_url=f"{first}/v1,{second}/v1")
+        standing_by(client, 1)
+        reasons = {client.post("/decide", json=report(step=step)).json()["reason"] for step in range(6)}
+        assert reasons == {"llm_status"}
+        ready = client.get("/readyz").json()
+        assert ready["model"] == "first" and ready["llm"] == "ready", ready
