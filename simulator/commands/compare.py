@@ -45,7 +45,7 @@ def compare(options: Compare, console: Console) -> int:
     """Print the table and write the page; returns the exit code.
 
     Raises:
-        UsageError: fewer than two runs, one that cannot be read, or a page that cannot be written.
+        UsageError: fewer than two runs, one that cannot be read, or a page that cannot be written or is another file.
     """
     if len(options.runs) < 2:
         raise UsageError("name two or more missions' folders, such as runs/eof runs/wqcs")
@@ -62,6 +62,8 @@ def compare(options: Compare, console: Console) -> int:
     console.print(caution(runs), markup=False, highlight=False, soft_wrap=True)
     with naming_out(options.out):
         options.out.parent.mkdir(parents=True, exist_ok=True)
+        if options.out.exists() and b"missions compared</title>" not in options.out.read_bytes():
+            raise UsageError(f"--out {options.out} is there already and is no comparison: choose another file")
         options.out.write_text(render_comparison(runs), encoding="utf-8")
     console.print(f"Wrote {options.out}", markup=False, highlight=False, soft_wrap=True)
     return 0

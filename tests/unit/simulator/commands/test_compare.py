@@ -52,3 +52,14 @@ def test_bad_use_is_one_line_and_code_2(runs: list[Path], tmp_path: Path, capsys
         assert compare.main(arguments) == 2
         error = capsys.readouterr().err
         assert said in error and error.count("\n") == 1
+
+
+def test_a_comparison_replaces_only_a_comparison(
+    runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page, record = tmp_path / "page.html", tmp_path / "summary.json"
+    record.write_bytes((runs[0] / "summary.json").read_bytes())
+    for out, code in ((page, 0), (page, 0), (record, 2)):
+        assert compare.main([*map(str, runs), "--out", str(out)]) == code
+    assert "is no comparison: choose another file" in capsys.readouterr().err
+    assert record.read_bytes() == (runs[0] / "summary.json").read_bytes()
