@@ -1,7 +1,6 @@
 """The stages of a decision: augment, attend, prompt, choose, enforce, commit."""
 
 import asyncio
-import secrets
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ from service.deciding.decision_task import Choice, DecisionTask, Fallback
 from service.deciding.llm_query import LlmQueries
 from service.deciding.modes import modes_by_name
 from service.deciding.stopwatch import Deadline
+from service.mission.decisions import new_decision_id
 from service.mission.events import AdviserReport
 from service.mission.mission import Mission
 from service.prompting.prompt import Prompt
@@ -74,7 +74,7 @@ class Pipeline:
             if not mode.plan_first:
                 await _await_plan(task)
             choice = choice.to(_without_llm(state))
-        orders, decision_id = task.mission.guidance.orders, secrets.token_hex(16)
+        orders, decision_id = task.mission.guidance.orders, new_decision_id()
         if orders is not None:
             # The operator may have confirmed orders since the mode's choice.
             velocity = orders.nearest(choice.action.velocity, task.mission.scenario.max_velocity + 1)

@@ -63,7 +63,11 @@ class Engine:
         self._batches = BatchDecider(self.pipeline, self.queries)
         self.journal: Journal | NullJournal = NullJournal() if store is None else Journal(store, metrics)
         self._feedback = Feedback(metrics, self.journal, self.live)
-        self.missions = MissionRegistry(settings, metrics, self.journal, store, self.compiler.compile, self.live.forget)
+        self.missions = MissionRegistry(settings, metrics, self.journal, store, self._loaded, self.live.forget)
+
+    def _loaded(self, mission: Mission) -> None:
+        self.live.watch.restored(mission)
+        self.compiler.compile(mission)
 
     def hurry(self) -> None:
         """Prepare to close: queries to the LLM end within seconds, and pages get no more updates."""

@@ -85,6 +85,12 @@ class FleetWatch:
             watched.overflows += watched.full[step]
         self._hear(watched, mission, uav, step)
 
+    def restored(self, mission: Mission) -> None:
+        """Record when a mission of the store had its newest decision: its fleet may have been silent ever since."""
+        now = time.time()
+        if (at := mission.reservations.newest_at(now)) is not None:
+            self.of(mission.mission_id).decided_at = time.monotonic() - (now - at)
+
     def of(self, mission_id: str) -> Watched:
         """The mission's observations."""
         found = self._missions.get(mission_id)

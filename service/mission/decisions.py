@@ -1,6 +1,8 @@
 """A fleet's decisions: their reservations, pending outcomes and applied outcomes."""
 
 import math
+import secrets
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -17,6 +19,11 @@ MAX_STEPS_APART = 64
 # An outcome comes with the UAV's next request, so a few steps of a fleet suffice. Older entries are forgotten.
 PENDING_PER_UAV = 8
 _APPLIED_PER_UAV = 64
+
+
+def new_decision_id() -> str:
+    """An ID that begins with its time: 48 bits of Unix milliseconds, then 80 random ones."""
+    return f"{time.time_ns() // 1_000_000:012x}{secrets.token_hex(10)}"
 
 
 class Pending(NamedTuple):
@@ -199,6 +206,12 @@ class Reservations:
     def of(self, step: int, uav_id: int) -> Reservation | None:
         """The UAV's reservation at this step."""
         return next((own for own in self._by_step.get(step, ()) if own.uav_id == uav_id), None)
+
+    def newest_at(self, now: float) -> float | None:
+        """When the newest decision was made, Unix seconds, no later than ``now``; None without any that says so."""
+        every = (own.decision_id for reservations in self._by_step.values() for own in reservations)
+        # IDs of earlier versions are random: they say any time, of which nearly all are in the future.
+        return max((at for at in (int(name[:12], 16) / 1e3 for name in every) if at <= now), default=None)
 
     def reserve(self, step: int, reservation: Reservation) -> Reservation | None:
         """Reserve a sensor in place of the UAV's earlier one at this step, which is returned.

@@ -87,6 +87,9 @@ class Clock:
     def monotonic(self) -> float:
         return time.monotonic() + self.ahead_s
 
+    def time(self) -> float:
+        return time.time() + self.ahead_s
+
 
 class Striding:
     """Replaces a module's ``time``: it advances only by a stride at each call."""

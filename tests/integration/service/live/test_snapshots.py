@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from tests.integration.service.live.test_broadcaster import Edge, Report, decided, watching
+from tests.support.stored_missions import copy_of, fly, on_disk, running
 from tests.support.waiting import Clock
 
 
@@ -72,3 +75,20 @@ def test_a_new_visit_order_is_due_by_its_own_first_step_and_a_late_uav_shows_its
     [since] = [one["since_step"] for one in told["guidance"]["orders"]]
     assert since >= 5 and told["guidance"]["due"] == [{"sensor_id": 9, "visit_every": 3, "due": since + 2}]
     assert [told["uavs"][number]["step"] for number in ("0", "1")] == [5, 4]
+
+
+def test_a_fleet_that_is_silent_since_before_a_restart_is_lost(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "missions.db"
+    with running(path) as (client, engine):
+        fly(client, report, range(3))
+        on_disk(engine)
+        killed = copy_of(path, tmp_path / "killed.db")
+    clock = Clock()
+    monkeypatch.setattr("service.live.fleet_watch.time", clock)
+    clock.ahead_s = 120.0
+    for stored in (path, killed):
+        with running(stored) as (client, _):
+            assert set(client.get("/missions/test").json()["alarms"]["uav_lost"]) == {"0", "1", "2"}
+            assert 'aicvds_alarms{kind="uav_lost"} 3.0' in client.get("/metrics").text
