@@ -172,12 +172,10 @@ def _serve_cluster(listener: socket.socket, settings: Settings, ray: str, least:
     logs.configure(settings.log_level, settings.log_format)
     try:
         server = serve_cluster(listener, settings, ray, least, most)
+        if server.error is not None:
+            raise server.error
     except RayUnusable as error:
         return _refused(str(error))
-    if isinstance(server.error, RayUnusable):
-        return _refused(str(server.error))
-    if server.error is not None:
-        raise server.error
     return 0
 
 

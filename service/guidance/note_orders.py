@@ -150,10 +150,10 @@ def _orders_in(text: str) -> list[str]:
     if stripped.startswith("{"):
         try:
             orders = json.loads(stripped)["orders"]
+            if not isinstance(orders, list) or not all(isinstance(order, str) for order in orders):
+                raise ValueError("no list of texts")
         except (ValueError, KeyError, RecursionError):
             raise BadOrders(f"{text[:80]!r} is not a JSON object with a list of orders") from None
-        if not isinstance(orders, list) or not all(isinstance(order, str) for order in orders):
-            raise BadOrders(f"{text[:80]!r} is not a JSON object with a list of orders")
         return orders[:MOST_ORDERS]
     return [] if stripped == NOTHING else stripped.split(SEPARATOR)[:MOST_ORDERS]
 

@@ -34,15 +34,9 @@ class Trajectory(Protocol):
 
 
 class Circle:
-    """A circle flown counter-clockwise; it begins due east of its centre.
-
-    Raises:
-        ValueError: the radius is not positive.
-    """
+    """A circle flown counter-clockwise; it begins due east of its centre. The radius is above 0."""
 
     def __init__(self, centre: Point, radius_m: float) -> None:
-        if not radius_m > 0:
-            raise ValueError(f"radius_m is {radius_m}, must be above 0")
         self._centre: FloatArray = np.array(centre, dtype=np.float64)
         self._radius_m = float(radius_m)
         self.length_m = 2.0 * math.pi * self._radius_m

@@ -94,7 +94,5 @@ def test_a_scenario_has_circles_unless_it_has_routes() -> None:
 
 
 def test_what_is_no_trajectory() -> None:
-    with pytest.raises(ValueError, match="radius_m is 0"):
-        Circle((0.0, 0.0), 0)
     with pytest.raises(ValueError, match="two different waypoints"):
         Polyline([(1, 1), (1, 1)])
