@@ -35,20 +35,18 @@ _OWNER = sa.text("""
     FROM leases WHERE mission_id = :mission_id
 """)
 # Rows are locked in the order of their keys, as the fence does: two transactions never wait for each other.
-_RENEW = sa.text("""
+_HELD = """
     WITH held AS (
         SELECT mission_id FROM leases WHERE owner = :owner AND expires_at > clock_timestamp()
         ORDER BY mission_id FOR UPDATE
     )
+"""
+_RENEW = sa.text(f"""{_HELD}
     UPDATE leases SET expires_at = clock_timestamp() + :term_s * interval '1 second'
     FROM held WHERE leases.mission_id = held.mission_id
     RETURNING leases.mission_id, leases.epoch
 """)
-_RELEASE = sa.text("""
-    WITH held AS (
-        SELECT mission_id FROM leases WHERE owner = :owner AND expires_at > clock_timestamp()
-        ORDER BY mission_id FOR UPDATE
-    )
+_RELEASE = sa.text(f"""{_HELD}
     UPDATE leases SET expires_at = clock_timestamp() FROM held WHERE leases.mission_id = held.mission_id
 """)
 _FOREIGN = sa.text("SELECT mission_id FROM leases WHERE mission_id = ANY(:mission_ids) AND owner <> :owner")

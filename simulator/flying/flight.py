@@ -122,16 +122,13 @@ def baselines(site: Site, seed: int, steps: int, names: Sequence[str] = BASELINE
     return {name: tally[:steps] for name, tally in flown.items()}
 
 
-def rollout(
-    world: PipelineWorld, policy: Policy, seed: int, on_step: Callable[[StepTally], None] | None = None
-) -> list[StepTally]:
+def rollout(world: PipelineWorld, policy: Policy, seed: int) -> list[StepTally]:
     """Fly one mission from ``reset(seed)`` to its end; UAV 0 decides first, and later UAVs know the sensors taken.
 
     Args:
         world: this function resets it with the seed.
         policy: this function resets it with the world's scenario and the seed.
         seed: of the world, and of a random policy.
-        on_step: called after every step with its tally; the world's state is the one after the step.
 
     Returns:
         The world's tally, one entry a step.
@@ -149,6 +146,4 @@ def rollout(
         if isinstance(policy, LearningPolicy):
             for agent, uav in live.items():
                 policy.learn(uav, step, infos[agent]["failed"])
-        if on_step is not None:
-            on_step(world.tally[-1])
     return list(world.tally)

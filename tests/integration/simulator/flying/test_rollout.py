@@ -21,7 +21,7 @@ from simulator.flying.pilots import EdgePilot, LocalPilot
 from simulator.policies.registry import POLICY_NAMES, policy_named
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld
-from simulator.world.observation import Cost, Observation, StepTally
+from simulator.world.observation import Cost, Observation
 from tests.support.edge_stub import stub_edge
 
 
@@ -58,11 +58,10 @@ def test_each_uav_sees_its_own_position() -> None:
     assert [p for *_, p in recorder.calls[:3]] == [tuple(o["position"].tolist()) for o in observations.values()]
 
 
-def test_every_step_is_passed_to_the_callback_and_returned() -> None:
-    passed: list[StepTally] = []
+def test_every_step_is_returned() -> None:
     world = PipelineWorld()
-    tally = rollout(world, policy_named("eof"), seed=1, on_step=passed.append)
-    assert tally == passed == world.tally
+    tally = rollout(world, policy_named("eof"), seed=1)
+    assert tally == world.tally
     assert len(tally) == 30
 
 
