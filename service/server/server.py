@@ -48,6 +48,8 @@ _ARRIVING_S = 0.25
 # The longest that shutdown waits for decisions under way, which have to end within 4 s. With the last checkpoints and
 # the last commit that is less than the 10 s after which `docker stop` kills.
 _SHUTDOWN_S = 5
+# Until an idle connection is closed: longer than a step, so that a UAV's stays open.
+_KEPT_S = 75
 # Names and numbers of mallopt's options (malloc.h).
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 _BYTES = 128 * 1024
@@ -239,6 +241,7 @@ class Server(uvicorn.Server):
             # The edge has no websockets; their library would read request heads without a limit.
             ws="none",
             log_level=log_level,
+            timeout_keep_alive=_KEPT_S,
             timeout_graceful_shutdown=_SHUTDOWN_S,
             access_log=log_level == "debug",
         )

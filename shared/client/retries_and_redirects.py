@@ -156,7 +156,8 @@ def parse(model: type[Answer], answer: httpx.Response) -> Answer:
     if not answer.is_success:
         raise EdgeProtocolError(f"{answer.url} answered {answer.status_code}; is that an AIC-VDS edge?")
     try:
-        return model.model_validate_json(answer.content)
+        # A later version of the edge may have further fields.
+        return model.model_validate_json(answer.content, extra="ignore")
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"]) or "the body"

@@ -90,7 +90,7 @@ class WeightArray(Wire):
 
 
 class MissionAttention(Wire):
-    """``GET /missions/{id}/attention``: with the scenario, everything to score sensors as the mission does.
+    """``GET /missions/{id}/attention``: with the scenario, all that scores need (:mod:`shared.features`).
 
     ``weights`` are ``query``, ``key`` and ``value`` ``(d', d)``, ``score`` ``(1, d')`` and ``bias`` ``(1,)``, of d
     features of the preset; the scores are ``softmax(Q K^T / sqrt(d')) V w + b`` with ``Q = X W_q^T`` and so on.

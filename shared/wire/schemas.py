@@ -124,7 +124,7 @@ class UavState(Received):
     height_m: float | None = omitted("m above the take-off place, for the page only", ge=-1000, le=1e5)
     top_speed_mps: float | None = omitted(
         "the ground speed that it has not exceeded though it was commanded more: the edge decides on no "
-        "higher velocity, to the nearest m/s, where the operator's orders allow that",
+        "higher velocity, to the nearest m/s and at least 1, where the orders allow that, until another is sent",
         gt=0,
         le=1000,
     )
@@ -231,7 +231,7 @@ class DecideResponse(Wire):
     mission_id: MissionId
     uav_id: UavId
     step: Step
-    sensor_id: SensorId = Field(description="collect from this sensor")
+    sensor_id: SensorId = Field(description="collect from this sensor, which the report may not name")
     velocity: int = Field(ge=0, le=14, description="m/s, for the next step")
     source: Source = Field(
         description="`llm`: the LLM's answer; `guided`: several advisers, the LLM among them; `value`: the learned "
@@ -242,7 +242,7 @@ class DecideResponse(Wire):
     top_k: list[Candidate]
     guided: Guided | None = Field(None, description="in mode `guided` only")
     tokens: Tokens
-    deadline_ms: int = Field(description="the time limit of this decision")
+    deadline_ms: int = Field(description="the time limit of this decision, once its request is read and checked")
     latency_ms: dict[str, float] = Field(description="by stage, and total")
     stored: bool = Field(
         True,
@@ -261,7 +261,7 @@ class FeedbackRequest(Outcome):
     """``POST /feedback``: an outcome on its own."""
 
     mission_id: MissionId | None = Field(
-        None, description="the decision's mission; omitted: the mission that knows the decision"
+        None, description="the decision's mission; omitted: the mission in memory that knows the decision"
     )
 
 

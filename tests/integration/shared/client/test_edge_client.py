@@ -12,10 +12,11 @@ from typing import Any
 import httpx
 import pytest
 
+from service.api.openapi import ANSWERS
 from shared.client.edge_client import AsyncEdgeClient, EdgeClient
 from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
-from shared.client.retries_and_redirects import edge_url
-from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec
+from shared.client.retries_and_redirects import edge_url, parse
+from shared.wire.schemas import DecideRequest, DecideResponse, FeedbackRequest, MissionSpec
 from shared.world.scenario import SCENARIOS
 from simulator.flying.edge_session import LossyTransport
 from simulator.world.environment import PipelineWorld
@@ -383,3 +384,11 @@ def test_a_deletion_that_is_redirected_is_none(client: Opened) -> None:
 def test_a_key_of_any_letters_is_sent(stub: EdgeStub, request_: DecideRequest) -> None:
     with EdgeClient(stub.url, api_key="aicvds_\u2026") as edge:
         assert edge.decide(request_).response.step == request_.step
+
+
+def test_a_later_edges_further_fields_are_ignored() -> None:
+    known = ANSWERS["post /decide"]
+    later = known | {"later": [1], "tokens": known["tokens"] | {"later": 2}}
+    answer, url = httpx.Response(200, json=later), "http://edge/decide"
+    answer.request = httpx.Request("POST", url)
+    assert parse(DecideResponse, answer) == DecideResponse.model_validate(known)
