@@ -48,6 +48,13 @@ def test_without_a_profile_there_are_the_edge_the_simulator_and_prometheus() -> 
     assert all(f"#   {profile} " in TEXT for profile in profiles)
 
 
+def test_what_runs_until_it_is_stopped_comes_back_after_a_reboot() -> None:
+    ends_by_itself = {"simulator": None, "ollama-pull": "on-failure:10"}
+    assert {name: service.get("restart") for name, service in SERVICES.items()} == {
+        name: ends_by_itself.get(name, "unless-stopped") for name in SERVICES
+    }
+
+
 @pytest.mark.parametrize("name", SERVICES)
 def test_a_service_is_of_one_version_and_sees_no_more_than_it_needs(name: str) -> None:
     service = SERVICES[name]
