@@ -1,6 +1,6 @@
 """How a command ends that cannot do what it is asked to."""
 
-# The exit code after Ctrl-C or SIGTERM.
+# The exit code after Ctrl-C, SIGTERM or SIGHUP.
 INTERRUPTED = 130
 
 

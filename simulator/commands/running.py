@@ -24,14 +24,14 @@ def command_main(options: type[Options], prog: str, argv: list[str], run: Callab
         prog: the command as people type it, such as ``aicvds simulate``.
         argv: the arguments after it.
         run: the command itself; returns its exit code, and its errors are printed as one line on stderr.
-            SIGTERM acts like Ctrl-C.
+            SIGTERM and SIGHUP act like Ctrl-C.
     """
     try:
         chosen = tyro.cli(options, prog=prog, args=argv)
     except SystemExit as done:
         return done.code if isinstance(done.code, int) else 2
     try:
-        with sigterm_interrupts():
+        with ends_interrupt():
             return run(chosen, Console())
     except (UsageError, EdgeError, RunFailed) as error:
         print(f"{prog}: {error}{_remedy(error)}", file=sys.stderr)
@@ -56,14 +56,18 @@ def _remedy(error: Exception) -> str:
 
 
 @contextmanager
-def sigterm_interrupts() -> Iterator[None]:
-    """Within the context, SIGTERM raises KeyboardInterrupt, so that `docker stop` leaves a result as Ctrl-C does."""
+def ends_interrupt() -> Iterator[None]:
+    """Within the context, SIGTERM and SIGHUP raise KeyboardInterrupt, so that `docker stop` and a closed terminal
+    leave a result as Ctrl-C does. One that is ignored, as SIGHUP is under nohup, stays ignored."""
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    # Windows has no SIGHUP.
+    numbers = {signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}
+    before = {each: signal.signal(each, interrupt) for each in numbers if signal.getsignal(each) != signal.SIG_IGN}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for each, handler in before.items():
+            signal.signal(each, handler)

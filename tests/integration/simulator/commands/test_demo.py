@@ -98,16 +98,20 @@ def test_a_taken_port_is_bad_use(stub: EdgeStub, tmp_path: Path, capsys: pytest.
 
 
 @pytest.mark.long
-def test_the_demo_stops_its_edge_when_interrupted(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_the_demo_stops_its_edge_when_interrupted(number: signal.Signals, tmp_path: Path) -> None:
     environment = {**os.environ, "AICVDS_MODE": "value"}
     arguments = ["demo", "--out", str(tmp_path), "--scenario", "dense"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "shared.kit.command_line", *arguments], stdout=subprocess.DEVNULL, env=environment
+        # Under nohup the tests' own process ignores SIGHUP.
+        ["env", "--default-signal=HUP", sys.executable, "-m", "shared.kit.command_line", *arguments],
+        stdout=subprocess.DEVNULL,
+        env=environment,
     )
     log = tmp_path / "decisions.jsonl"
     try:
         until(lambda: log.exists() and log.stat().st_size)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         assert process.wait(PATIENCE_S) == 130
     finally:
         process.kill()

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import pytest
@@ -67,12 +68,33 @@ def test_an_error_is_one_line_on_stderr_and_an_exit_code(
     assert capsys.readouterr().err == f"aicvds fly: {line}\n"
 
 
-def test_sigterm_ends_a_command_like_ctrl_c_and_its_handler_is_restored() -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_an_end_from_outside_is_like_ctrl_c_and_its_handler_is_restored(number: signal.Signals) -> None:
     def run(options: Fly) -> int:
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
         signal.pause()
         return 0
 
-    before = signal.getsignal(signal.SIGTERM)
-    assert flown([], run) == 130
-    assert signal.getsignal(signal.SIGTERM) is before
+    # Under nohup the tests' own process ignores SIGHUP.
+    with handled(number, signal.SIG_DFL):
+        assert flown([], run) == 130
+        assert signal.getsignal(number) == signal.SIG_DFL
+
+
+def test_under_nohup_a_closed_terminal_ends_nothing() -> None:
+    def run(options: Fly) -> int:
+        os.kill(os.getpid(), signal.SIGHUP)
+        return 0
+
+    with handled(signal.SIGHUP, signal.SIG_IGN):
+        assert flown([], run) == 0
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+
+
+@contextmanager
+def handled(number: signal.Signals, handler: signal.Handlers) -> Iterator[None]:
+    before = signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
