@@ -61,8 +61,10 @@ RUN install --directory --owner=aicvds --group=aicvds /store
 # Numba's functions are compiled here, for any processor: with a read-only root every start would compile them again.
 ENV PATH=/opt/aicvds/bin:$PATH PYTHONUNBUFFERED=1 AICVDS_CACHE_DIR=/opt/model AICVDS_STORE=none NUMBA_CPU_NAME=generic
 RUN python -c "from service.edge.compilation import compile_all; compile_all()"
-USER 10001:10001
 COPY docker/check_edge.py /opt/aicvds/
+# A checkout under umask 027 or 077 has it for its owner alone.
+RUN chmod 644 /opt/aicvds/check_edge.py
+USER 10001:10001
 RUN python /opt/aicvds/check_edge.py
 EXPOSE 8000
 # Healthy: the edge decides, and its LLM is not loading any more (ready, off, or known to be unavailable).

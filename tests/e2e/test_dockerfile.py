@@ -163,6 +163,15 @@ def test_every_file_that_is_copied_for_the_model_is_needed(tmp_path: Path) -> No
         assert ran.returncode != 0 and f"No module named '{module}'" in ran.stderr, ran.stdout + ran.stderr
 
 
+@pytest.mark.parametrize("image", ["edge", "simulator"])
+def test_an_images_user_can_read_what_is_copied_under_any_umask(image: str) -> None:
+    final = (ROOT / "docker" / f"{image}.Dockerfile").read_text().rpartition("\nFROM ")[2]
+    before, _, after = final.partition("USER ")
+    copied = re.findall(r"^COPY (?!--from)(\S+) (\S+/)$", before, re.MULTILINE)
+    assert "\nCOPY" not in after and before.count("\nCOPY") == len(copied) + before.count("\nCOPY --from")
+    assert [f"RUN chmod 644 {folder}{Path(file).name}\n" in before for file, folder in copied] == [True] * len(copied)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("image", "package", "version", "built"),
