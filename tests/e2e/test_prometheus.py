@@ -82,6 +82,41 @@ def test_every_alert_fires_when_it_should_and_only_then() -> None:
     assert {case["alertname"] for case in tried if not case["exp_alerts"]} == alerts
 
 
+def test_every_alert_that_the_guide_adds_has_a_value_when_it_should_and_only_then(tmp_path: Path) -> None:
+    """The same table of expressions, once of an edge without an LLM in a bad world and once of one without faults."""
+    guide = (ROOT / "docs" / "reference" / "metrics.md").read_text(encoding="utf-8")
+    expressions = re.findall(r"^\| [^`|]+ \| `(.+)` \|$", guide.partition("Further useful alerts")[2], re.MULTILINE)
+    decided = 'aicvds_decisions_total{{source="{}", reason="{}"}}'
+    bad = {
+        decided.format("policy", "llm_error"): "0+9x100",
+        "aicvds_costs_clipped_total": "0+1x100",
+        'aicvds_link_excess_db_bucket{le="5"}': "0x100",
+        'aicvds_link_excess_db_bucket{le="10"}': "0+9x100",
+        'aicvds_link_excess_db_bucket{le="+Inf"}': "0+9x100",
+        "aicvds_radio_failures_total": "0+1x100",
+    }
+    good = {
+        decided.format("guided", "none"): "0+9x100",
+        decided.format("policy", "llm_error"): "0+8x100",
+        "aicvds_costs_clipped_total": "3x100",
+        "aicvds_radio_failures_total": "3x100",
+    }
+    tests = [
+        {
+            "interval": "30s",
+            "input_series": [{"series": series, "values": values} for series, values in world.items()],
+            "promql_expr_test": [
+                {"expr": f"count({one})".replace(r"\|", "|"), "eval_time": "40m", "exp_samples": samples}
+                for one in expressions
+            ],
+        }
+        for world, samples in ((bad, [{"labels": "{}", "value": 1}]), (good, []))
+    ]
+    (tmp_path / "guide.yml").write_text(yaml.safe_dump({"rule_files": [], "tests": tests}))
+    promtool("test", "rules", str(tmp_path / "guide.yml"))
+    assert len(expressions) == 4
+
+
 def test_every_alert_compares_a_number_that_is_recorded() -> None:
     recorded = {rule["record"] for rule in rules() if "record" in rule}
     compared = [COMPARED.fullmatch(rule["expr"]) for rule in rules() if "alert" in rule]
