@@ -82,6 +82,22 @@ def test_every_alert_fires_when_it_should_and_only_then() -> None:
     assert {case["alertname"] for case in tried if not case["exp_alerts"]} == alerts
 
 
+def calculated(folder: Path, world: dict[str, str], expected: dict[str, tuple[str, float] | None]) -> bool:
+    """Whether each expression has this one value, or none, after a minute of these series of 5 s."""
+    cases = [
+        {
+            "expr": expression,
+            "eval_time": "1m",
+            "exp_samples": [{"labels": value[0], "value": value[1]}] if value else [],
+        }
+        for expression, value in expected.items()
+    ]
+    series = [{"series": name, "values": values} for name, values in world.items()]
+    test = {"interval": "5s", "input_series": series, "promql_expr_test": cases}
+    (folder / "tests.yml").write_text(yaml.safe_dump({"rule_files": [], "tests": [test]}))
+    return "SUCCESS" in promtool("test", "rules", str(folder / "tests.yml"))
+
+
 def test_every_alert_that_the_guide_adds_has_a_value_when_it_should_and_only_then(tmp_path: Path) -> None:
     """The same table of expressions, once of an edge without an LLM in a bad world and once of one without faults."""
     guide = (ROOT / "docs" / "reference" / "metrics.md").read_text(encoding="utf-8")
@@ -101,19 +117,9 @@ def test_every_alert_that_the_guide_adds_has_a_value_when_it_should_and_only_the
         "aicvds_costs_clipped_total": "3x100",
         "aicvds_radio_failures_total": "3x100",
     }
-    tests = [
-        {
-            "interval": "30s",
-            "input_series": [{"series": series, "values": values} for series, values in world.items()],
-            "promql_expr_test": [
-                {"expr": f"count({one})".replace(r"\|", "|"), "eval_time": "40m", "exp_samples": samples}
-                for one in expressions
-            ],
-        }
-        for world, samples in ((bad, [{"labels": "{}", "value": 1}]), (good, []))
-    ]
-    (tmp_path / "guide.yml").write_text(yaml.safe_dump({"rule_files": [], "tests": tests}))
-    promtool("test", "rules", str(tmp_path / "guide.yml"))
+    plain = [one.replace(r"\|", "|") for one in expressions]
+    assert calculated(tmp_path, bad, {f"count({one})": ("{}", 1) for one in plain})
+    assert calculated(tmp_path, good, {f"count({one})": None for one in plain})
     assert len(expressions) == 4
 
 
@@ -189,6 +195,26 @@ def filled_in(expression: str) -> str:
         expression = expression.replace(f"${name}", value)
     assert "$" not in expression, f"a variable that this test does not know: {expression}"
     return expression
+
+
+@pytest.mark.parametrize(
+    ("values", "count"),
+    [
+        ("_x3 30x20", 30),
+        # Decisions before the time shown do not count.
+        ("30x3 32x20", 2),
+        # A flight has ended.
+        ("_x3 30x3 stale", 30),
+    ],
+)
+def test_a_burst_of_decisions_is_counted(values: str, count: int, tmp_path: Path) -> None:
+    """A series begins with the first decisions of its source and reason: nothing comes before it."""
+    expressions = [filled_in(one) for one in found(BOARD, "expr") if "__range" in one]
+    metrics = {re.findall(r"aicvds_\w+", one)[0] for one in expressions}
+    labels = '{source="policy", reason="llm_error"}'
+    series = {metric + '{instance="e", source="policy", reason="llm_error"}': values for metric in metrics}
+    assert calculated(tmp_path, series, {f"round({one})": (labels, count) for one in expressions})
+    assert len(metrics) == len(expressions) == 2
 
 
 @contextmanager
