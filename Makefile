@@ -34,12 +34,17 @@ help:
 
 install: .venv/installed
 
-.venv/installed: pyproject.toml constraints.txt install.py
+# install.py makes a new .venv where this one is a copy of another checkout's, or its Python is gone.
+USABLE := $(shell .venv/bin/python -c '' >/dev/null 2>&1 && grep -Fqs '$(CURDIR)/.venv/bin/' .venv/bin/pip && echo yes)
+REMADE := $(if $(USABLE),,remade)
+.PHONY: remade
+
+.venv/installed: pyproject.toml constraints.txt install.py $(REMADE)
 	$(PYTHON) install.py all $(TORCH_INDEX:%=--torch-index %)
 	@touch $@ .venv/demo
 
 # What serves, simulates and draws.
-.venv/demo: pyproject.toml constraints.txt install.py
+.venv/demo: pyproject.toml constraints.txt install.py $(REMADE)
 	$(PYTHON) install.py demo
 	@touch $@
 

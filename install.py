@@ -35,8 +35,11 @@ def main() -> int:
     args = parser.parse_args()
     began = time.monotonic()
     try:
-        if not (VENV / "bin" / "pip").exists():
-            venv.create(VENV, with_pip=True)
+        if not usable():
+            # What a link leads to may be another checkout's.
+            if VENV.is_symlink():
+                VENV.unlink()
+            venv.create(VENV, with_pip=True, symlinks=True, clear=True)
         installer = _pip() if args.pip else _uv() or _pip()
         print(f"Installing {args.what} into {VENV.name} by {installer.name}", flush=True)
         if args.torch_index:
@@ -52,6 +55,18 @@ def main() -> int:
         return 1
     print(f"Installed in {time.monotonic() - began:.0f} s", flush=True)
     return 0
+
+
+def usable() -> bool:
+    """Whether .venv is of this folder and of this version of Python: no copy of another checkout's, and with pip."""
+    told = "import pip, sys; print(sys.version_info[:2], sys.prefix)"
+    try:
+        found = subprocess.run([PYTHON, "-c", told], capture_output=True, text=True, check=False).stdout.strip()
+        # Its first lines name the interpreter that runs it.
+        pip = (VENV / "bin" / "pip").read_text()
+    except OSError:
+        return False
+    return found == f"{sys.version_info[:2]} {VENV}" and f"{VENV / 'bin'}/" in pip
 
 
 def _prepare() -> None:

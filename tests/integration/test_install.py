@@ -1,0 +1,67 @@
+"""What `make install` and `make demo` do with a .venv that is there.."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import install
+from tests.support.places import ROOT
+
+OTHER = (sys.version_info[0], sys.version_info[1] - 1)
+
+
+def checkout(folder: Path, version: tuple[int, int] = sys.version_info[:2]) -> Path:
+    """A folder whose .venv has been installed into, with programs that only say where they are."""
+    commands = folder / ".venv" / "bin"
+    commands.mkdir(parents=True)
+    (commands / "python").write_text(f"#!/bin/sh\necho '{version}' '{folder}/.venv'\n")
+    (commands / "python").chmod(0o755)
+    (commands / "pip").write_text(f"#!{commands}/python\n")
+    for name in ("Makefile", "pyproject.toml", "constraints.txt", "install.py"):
+        shutil.copy(ROOT / name, folder)
+    for stamp in ("installed", "demo"):
+        (folder / ".venv" / stamp).touch()
+    return folder
+
+
+def usable(folder: Path, monkeypatch: pytest.MonkeyPatch) -> bool:
+    monkeypatch.setattr(install, "VENV", folder / ".venv")
+    monkeypatch.setattr(install, "PYTHON", folder / ".venv" / "bin" / "python")
+    return install.usable()
+
+
+def installs(folder: Path) -> list[bool]:
+    """Whether `make install` and `make demo` would call install.py."""
+    return [
+        "install.py"
+        in subprocess.check_output(["make", "--no-print-directory", "--dry-run", target], cwd=folder, text=True)
+        for target in ("install", "demo")
+    ]
+
+
+def test_what_is_installed_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = checkout(tmp_path / "here")
+    assert usable(folder, monkeypatch) and installs(folder) == [False, False]
+
+
+def test_a_copied_checkout_gets_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Path(shutil.copytree(checkout(tmp_path / "here"), tmp_path / "copy"))
+    assert not usable(folder, monkeypatch) and installs(folder) == [True, True]
+
+
+def test_a_python_that_is_gone_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = checkout(tmp_path / "here")
+    python = folder / ".venv" / "bin" / "python"
+    python.unlink()
+    python.symlink_to(tmp_path / "no-python")
+    assert not usable(folder, monkeypatch) and installs(folder) == [True, True]
+
+
+def test_another_version_of_python_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not usable(checkout(tmp_path / "here", OTHER), monkeypatch)
+    assert not usable(tmp_path / "empty", monkeypatch)
