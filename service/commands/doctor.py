@@ -5,6 +5,7 @@ import os
 import platform
 import shutil
 import socket
+import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -201,11 +202,12 @@ def _timed(found: "Examination", deadline_ms: int) -> str:
 
 
 def embedded(settings: Settings) -> Iterator[Finding]:
-    """Whether the embedded LLM has its library, its file and the vocabulary."""
+    """Whether the embedded LLM has its library, which needs libgomp, its file and the vocabulary."""
     from service.llm.model_file import ModelMissing, embedded_model
 
-    if find_spec("xllamacpp") is None:
-        yield Finding("LLM", "xllamacpp is not installed", "pip install 'aic-vds[service]', or set AICVDS_LLM_URL")
+    if subprocess.run([sys.executable, "-P", "-c", "import xllamacpp"], capture_output=True, check=False).returncode:
+        remedy = "apt-get install libgomp1, pip install 'aic-vds[service]', or set AICVDS_LLM_URL"
+        yield Finding("LLM", "llama.cpp (xllamacpp) cannot be loaded", remedy)
         return
     try:
         file = embedded_model(settings)

@@ -109,6 +109,17 @@ def test_an_llm_server_is_asked_as_the_edge_asks_it() -> None:
     assert gone.remedy is not None
 
 
+def test_an_llm_that_cannot_be_loaded_is_in_the_way(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    fault = "libgomp.so.1: cannot open shared object file"
+    (tmp_path / "xllamacpp.py").write_text(f"raise ImportError({fault!r})\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    assert doctor.main(["--port", str(free_port())]) == 1
+    printed = capsys.readouterr().out
+    assert "llama.cpp (xllamacpp) cannot be loaded" in printed and "apt-get install libgomp1" in printed
+
+
 def test_a_missing_model_file_is_fetched(tmp_path: Path) -> None:
     [found] = doctor.embedded(Settings(cache_dir=tmp_path))
     assert found.remedy == "aicvds model fetch"
