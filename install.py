@@ -33,6 +33,8 @@ def main() -> int:
     parser.add_argument("--torch-index", default="", help="install torch from this index")
     parser.add_argument("--pip", action="store_true", help="install by pip, even where uv could be had")
     args = parser.parse_args()
+    # What it installs is for .venv alone, whatever pip's settings say: `user = true` would end the installation.
+    os.environ["PIP_USER"] = "0"
     began = time.monotonic()
     try:
         if not usable():

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
+import venv
 from pathlib import Path
 
 import pytest
@@ -65,3 +67,28 @@ def test_a_python_that_is_gone_is_replaced(tmp_path: Path, monkeypatch: pytest.M
 def test_another_version_of_python_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not usable(checkout(tmp_path / "here", OTHER), monkeypatch)
     assert not usable(tmp_path / "empty", monkeypatch)
+
+
+def test_a_link_is_replaced_and_not_what_it_leads_to_and_pip_installs_for_no_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = checkout(tmp_path / "other") / ".venv"
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / ".venv").symlink_to(other)
+    assert not usable(tmp_path / "here", monkeypatch)
+    monkeypatch.setenv("PIP_USER", "1")
+    monkeypatch.setattr(sys, "argv", ["install.py", "demo"])
+    # Instead of an installation: what pip would be told.
+    told: list[str] = []
+
+    def nothing() -> install.Installer:
+        told.append(os.environ["PIP_USER"])
+        return install.Installer("none", [sys.executable, "-c", ""], "", {})
+
+    monkeypatch.setattr(install, "HERE", tmp_path / "here")
+    monkeypatch.setattr(install, "_uv", nothing)
+    monkeypatch.setattr(install, "_prepare", lambda: None)
+    monkeypatch.setattr(venv, "create", lambda folder, **options: folder.mkdir())
+    assert install.main() == 0
+    assert told == ["0"] and (other / "bin" / "pip").exists()
+    assert not (tmp_path / "here" / ".venv").is_symlink()
