@@ -118,6 +118,9 @@ def _uv() -> Installer | None:
     settings = pip_settings()
     # As pip does: the best version of all indexes, not the first index that has the package.
     command = [str(uv), "pip", "install", "--quiet", "--python", str(PYTHON), "--index-strategy", "unsafe-best-match"]
+    # It ends where its cache cannot be written, as in a home that is read-only or not there; pip goes on.
+    if subprocess.run([uv, "pip", "list", "--python", PYTHON], capture_output=True, check=False).returncode:
+        command.append("--no-cache")
     options = {
         "extra-index-url": "--index",
         "find-links": "--find-links",

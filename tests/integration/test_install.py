@@ -92,3 +92,19 @@ def test_a_link_is_replaced_and_not_what_it_leads_to_and_pip_installs_for_no_use
     assert install.main() == 0
     assert told == ["0"] and (other / "bin" / "pip").exists()
     assert not (tmp_path / "here" / ".venv").is_symlink()
+
+
+@pytest.mark.parametrize("code", [0, 2])
+def test_uv_does_without_a_cache_where_it_cannot_write_one(
+    code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commands = checkout(tmp_path / "here") / ".venv" / "bin"
+    # As uv 0.13 ends in each of its commands that use the cache.
+    (commands / "uv").write_text(f"#!/bin/sh\nexit {code}\n")
+    (commands / "uv").chmod(0o755)
+    monkeypatch.setattr(install, "VENV", commands.parent)
+    monkeypatch.setattr(install, "PYTHON", commands / "python")
+    ran: list[list[str]] = []
+    monkeypatch.setattr(install.Installer, "__init__", lambda self, name, command, option, env: ran.append(command))
+    install._uv()
+    assert ("--no-cache" in ran[0]) is (code == 2)
