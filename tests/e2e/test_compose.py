@@ -24,7 +24,9 @@ def test_every_variable_is_told_of_with_its_default() -> None:
     defaults = dict(re.findall(r"\$\{(\w+):-([^}]*)\}", TEXT))
     assert len(defaults) == len({*re.findall(r"\$\{(\w+)", TEXT)})
     # Examples rather than defaults, as their comments say.
-    examples = {"AICVDS_RUNS", "AICVDS_USER", "AICVDS_KEYS_DIR"}
+    examples = {"AICVDS_RUNS", "AICVDS_USER", "AICVDS_KEYS_DIR", "AICVDS_HOSTS", "AICVDS_READINGS_KEY"}
+    # Of a line without a value, uncommented, the comment would be the value.
+    assert all(LINES.values())
     assert {name: LINES.get(name) for name in defaults if name not in examples} == {
         name: default for name, default in defaults.items() if name not in examples
     }
