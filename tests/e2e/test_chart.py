@@ -8,9 +8,12 @@ import re
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 import yaml
+from starlette.responses import Response
 
+from service.api.authentication import KnownHosts
 from service.config.settings import Settings
 from tests.support.chart_tools import CHART, helm, run, validator
 from tests.support.places import ROOT
@@ -141,6 +144,20 @@ def test_numbers_and_switches_arrive_as_the_edge_writes_them(tmp_path: Path) -> 
         "AICVDS_MAX_BODY_BYTES": "2000000",
         "AICVDS_LEARNING_RATE": "0.0005",
     }
+
+
+@pytest.mark.parametrize(("given", "elsewhere"), [("fleet.example.org", 403), ("", 204), ("*", 204)])
+async def test_without_keys_an_edge_answers_to_its_services_names(tmp_path: Path, given: str, elsewhere: int) -> None:
+    values = SMALL | {"settings": {"AICVDS_ANONYMOUS": "on", "AICVDS_HOSTS": given}}
+    hosts = environment(rendered(tmp_path, values))["AICVDS_HOSTS"]
+    edge = KnownHosts(Response(status_code=204), Settings(hosts=hosts, anonymous="on", store="none"))
+    names = ["fleet.example.org", "fleet-aicvds:8000", *(f"fleet-aicvds.uavs{end}" for end in ("", ".svc"))]
+    async with httpx.AsyncClient(transport=httpx.ASGITransport(edge)) as client:
+        found = [
+            (await client.get(f"http://{name}/")).status_code
+            for name in (*names, "fleet-aicvds.uavs.svc.cluster.local", "elsewhere.example.org")
+        ]
+    assert found == [204] * 5 + [elsewhere]
 
 
 def test_opentelemetrys_switches_are_its_own_words(tmp_path: Path) -> None:
