@@ -224,6 +224,10 @@ def test_the_container_is_as_the_image_and_compose_have_it(objects: Objects) -> 
         ({"image": {"tag": "1"}, "settings": {"AICVDS_STORE": "postgresql://u:p@h/d"}}, "AICVDS_STORE"),
         ({"image": {"tag": "1"}, "graceSeconds": 5}, "graceSeconds"),
         ({"image": {"tag": "1"}, "replica": 3}, "replica"),
+        (
+            {"image": {"tag": "1"}, "keys": {"secretName": "keys"}, "metrics": {"scrape": "serviceMonitor"}},
+            "metrics.keySecret",
+        ),
     ],
 )
 def test_a_value_that_cannot_be_meant_is_refused(tmp_path: Path, values: dict[str, Any], fault: str) -> None:
