@@ -107,6 +107,13 @@ def test_helm_finds_no_fault() -> None:
     assert "0 chart(s) failed" in done.stdout
 
 
+def test_helm_has_the_options_of_an_upgrade() -> None:
+    guide = (ROOT / "docs" / "guides" / "upgrading.md").read_text(encoding="utf-8")
+    asked = set(re.findall(r"--[a-z][a-z-]+", guide.partition("With Helm: ")[2]))
+    assert asked == {"--reuse-values", "--set", "--reset-then-reuse-values", "--set-string"}
+    assert asked <= set(re.findall(r"--[a-z][a-z-]+", run("upgrade", "--help").stdout))
+
+
 def test_kubernetes_knows_every_field(objects: Objects) -> None:
     known = 0
     for (kind, name), one in objects.items():
