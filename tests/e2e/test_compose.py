@@ -14,7 +14,7 @@ from service.config.settings import Settings
 from tests.support.places import ROOT
 
 TEXT = (ROOT / "docker-compose.yml").read_text()
-SERVICES = yaml.safe_load(TEXT)["services"]
+SERVICES, VOLUMES = (yaml.safe_load(TEXT)[part] for part in ("services", "volumes"))
 LINES = dict(re.findall(r"^#(\w+)=(.*?)(?:  # .*)?$", (ROOT / ".env.example").read_text(), re.MULTILINE))
 # Taken by Compose itself, or by programs in the containers, under their own names.
 PASSED_ON = {"HF_TOKEN", "COMPOSE_PROFILES"}
@@ -55,6 +55,15 @@ def test_what_runs_until_it_is_stopped_comes_back_after_a_reboot() -> None:
     assert {name: service.get("restart") for name, service in SERVICES.items()} == {
         name: ends_by_itself.get(name, "unless-stopped") for name in SERVICES
     }
+
+
+def test_what_is_written_is_in_a_volume_with_a_name() -> None:
+    """An image's own volume without a name is a new, empty one each time that its container is made again."""
+    mounts = [mount.split(":") for service in SERVICES.values() for mount in service.get("volumes", ())]
+    named = {source for source, *_ in mounts if source.isalpha()}
+    assert named | {"keys", "runs"} == VOLUMES.keys()
+    [folder] = [word.split("=")[1] for word in SERVICES["prometheus"]["command"] if "tsdb.path=" in word]
+    assert ["prometheus", folder] in mounts
 
 
 @pytest.mark.parametrize("name", SERVICES)
