@@ -1,5 +1,6 @@
 # The edge: the decision service, its LLM and its token vocabulary. At run time it downloads nothing.
-#   docker build -f docker/edge.Dockerfile -t aicvds-edge .
+# `make release` builds it with its version; built without VERSION, it calls itself 0.1.0.dev0.
+#   docker build --build-arg VERSION=1.2.3 -f docker/edge.Dockerfile -t aicvds-edge .
 #   docker run --rm -p 127.0.0.1:8000:8000 -e AICVDS_ANONYMOUS=on aicvds-edge
 
 FROM python:3.11-slim-bookworm AS dependencies

@@ -1,5 +1,6 @@
 # The simulator: the UAVs and the world. It reaches an edge over HTTP and writes a run's folder.
-#   docker build -f docker/simulator.Dockerfile -t aicvds-simulator .
+# `make release` builds it with its version; built without VERSION, it calls itself 0.1.0.dev0.
+#   docker build --build-arg VERSION=1.2.3 -f docker/simulator.Dockerfile -t aicvds-simulator .
 #   docker run --rm --network host -v aicvds-runs:/runs aicvds-simulator \
 #     aicvds simulate --edge http://127.0.0.1:8000 --out /runs/first
 
