@@ -223,6 +223,17 @@ def test_the_container_is_as_the_image_and_compose_have_it(objects: Objects) -> 
 
 
 @pytest.mark.parametrize(
+    ("version", "policy"), [("1.26.9", None), ("1.27.0", "AlwaysAllow"), ("1.37.1", "AlwaysAllow")]
+)
+def test_an_edge_that_is_not_ready_may_be_evicted(tmp_path: Path, version: str, policy: str | None) -> None:
+    (tmp_path / "values.yaml").write_text(yaml.safe_dump(LARGE))
+    shown = ("--values", str(tmp_path / "values.yaml"), "--show-only", "templates/disruptionbudget.yaml")
+    done = run("template", str(CHART), "--kube-version", version, *shown)
+    assert done.returncode == 0, done.stderr
+    assert yaml.safe_load(done.stdout)["spec"].get("unhealthyPodEvictionPolicy") == policy
+
+
+@pytest.mark.parametrize(
     ("values", "fault"),
     [
         ({"image": {"tag": "1"}}, "API keys"),
