@@ -38,7 +38,10 @@ LARGE: dict[str, Any] = {
         "AICVDS_LLM_ORDER": "mission",
         "AICVDS_LLM_SLOTS": 8,
         "OTEL_EXPORTER_OTLP_ENDPOINT": "http://collector:4318",
+        "SSL_CERT_FILE": "/ca/ca.crt",
     },
+    "extraVolumes": [{"name": "ca", "configMap": {"name": "ca"}}],
+    "extraVolumeMounts": [{"name": "ca", "mountPath": "/ca", "readOnly": True}],
     "secretSettings": {"AICVDS_LLM_API_KEY": {"name": "aicvds", "key": "llm-api-key"}},
     "keys": {"secretName": "aicvds-keys"},
     "advertiseUrl": "https://$(POD_NAME).edges.example.org",
@@ -105,6 +108,15 @@ def test_helm_finds_no_fault() -> None:
     done = run("lint", "--strict", str(CHART))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 chart(s) failed" in done.stdout
+
+
+def test_an_edge_sees_every_volume_of_its_pod(objects: Objects) -> None:
+    pod = objects["StatefulSet", "fleet-aicvds"]["spec"]["template"]["spec"]
+    mounted = {mount["name"]: mount["mountPath"] for mount in pod["containers"][0]["volumeMounts"]}
+    assert mounted.keys() == {volume["name"] for volume in pod["volumes"]}
+    assert len(mounted) == len(pod["volumes"]) == (1 if "keys" not in mounted else 3)
+    if "SSL_CERT_FILE" in (given := environment(objects)):
+        assert given["SSL_CERT_FILE"].startswith(mounted["ca"])
 
 
 def test_helm_has_the_options_of_an_upgrade() -> None:
