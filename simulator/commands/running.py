@@ -1,5 +1,6 @@
 """Running a command: parsing its command line, and turning its errors into messages and exit codes."""
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -60,7 +61,12 @@ def ends_interrupt() -> Iterator[None]:
     """Within the context, SIGTERM and SIGHUP raise KeyboardInterrupt, so that `docker stop` and a closed terminal
     leave a result as Ctrl-C does. One that is ignored, as SIGHUP is under nohup, stays ignored."""
 
+    terminals = [each for each in (1, 2) if os.isatty(each)]
+
     def interrupt(signum: int, frame: FrameType | None) -> None:
+        # After SIGHUP a line written to the terminal would be an error, and end what writes the result.
+        for each in terminals if signum != signal.SIGTERM else ():
+            os.dup2(os.open(os.devnull, os.O_WRONLY), each)
         raise KeyboardInterrupt
 
     # Windows has no SIGHUP.

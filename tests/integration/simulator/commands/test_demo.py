@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import pty
 import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -102,16 +104,25 @@ def test_a_taken_port_is_bad_use(stub: EdgeStub, tmp_path: Path, capsys: pytest.
 def test_the_demo_stops_its_edge_when_interrupted(number: signal.Signals, tmp_path: Path) -> None:
     environment = {**os.environ, "AICVDS_MODE": "value"}
     arguments = ["demo", "--out", str(tmp_path), "--scenario", "dense"]
-    process = subprocess.Popen(
-        # Under nohup the tests' own process ignores SIGHUP.
-        ["env", "--default-signal=HUP", sys.executable, "-m", "shared.kit.command_line", *arguments],
-        stdout=subprocess.DEVNULL,
-        env=environment,
-    )
+    # Under nohup the tests' own process ignores SIGHUP.
+    command = ["env", "--default-signal=HUP", sys.executable, "-m", "shared.kit.command_line", *arguments]
+    terminal, its_end = pty.openpty()
+    os.set_blocking(terminal, False)
+    shown = its_end if number == signal.SIGHUP else subprocess.DEVNULL
+    process = subprocess.Popen(command, stdout=shown, stderr=shown, env=environment)
+    os.close(its_end)
     log = tmp_path / "decisions.jsonl"
+
+    def decided() -> bool:
+        with suppress(OSError):
+            os.read(terminal, 65_536)
+        return log.exists() and log.stat().st_size > 0
+
     try:
-        until(lambda: log.exists() and log.stat().st_size)
+        until(decided)
         process.send_signal(number)
+        # From here on, whatever is written to it is an error.
+        os.close(terminal)
         assert process.wait(PATIENCE_S) == 130
     finally:
         process.kill()
