@@ -192,11 +192,11 @@ def _llm_server(settings: Settings) -> Iterator[Finding]:
 
 def _timed(found: "Examination", deadline_ms: int) -> str:
     tokens = ""
-    if found.prompt_tokens is not None and found.completion_tokens is not None:
-        cached = f" ({found.cached_tokens} cached)" if found.cached_tokens is not None else ""
-        read = found.prompt_tokens - (found.cached_tokens or 0)
-        rate = (read + found.completion_tokens) / max(found.seconds, 1e-3)
-        count = f"prompt {found.prompt_tokens} tokens{cached}, answer {found.completion_tokens}"
+    if found.answer.prompt_tokens is not None and found.answer.completion_tokens is not None:
+        cached = f" ({found.answer.cached_tokens} cached)" if found.answer.cached_tokens is not None else ""
+        read = found.answer.prompt_tokens - (found.answer.cached_tokens or 0)
+        rate = (read + found.answer.completion_tokens) / max(found.seconds, 1e-3)
+        count = f"prompt {found.answer.prompt_tokens} tokens{cached}, answer {found.answer.completion_tokens}"
         tokens = f"; {count}, {rate:,.0f} a second"
     return f"a decision took {found.seconds:.2f} s of the deadline's {deadline_ms / 1e3:g} s{tokens}"
 

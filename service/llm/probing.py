@@ -204,16 +204,13 @@ class Examination:
 
     Attributes:
         terms: changes of a request that it demands, in words.
-        seconds: of the decision, with the static block in the prefix cache if the server has one.
-        prompt_tokens, cached_tokens, completion_tokens: of the decision; None if the server does not count them.
+        seconds: of the decision ``answer``, with the static block in the prefix cache if the server has one.
     """
 
     abilities: Abilities
     terms: str
+    answer: Completion
     seconds: float
-    prompt_tokens: int | None
-    cached_tokens: int | None
-    completion_tokens: int | None
 
 
 async def examine(settings: Settings, warm_up: WarmUp) -> Examination:
@@ -228,8 +225,6 @@ async def examine(settings: Settings, warm_up: WarmUp) -> Examination:
     client = client_of(settings)
     try:
         able = await probe(client, settings.llm_model)
-        answer, seconds = await first_decision(client, able.model, warm_up, able)
-        counts = answer.prompt_tokens, answer.cached_tokens, answer.completion_tokens
-        return Examination(able, str(client.terms), seconds, *counts)
+        return Examination(able, str(client.terms), *await first_decision(client, able.model, warm_up, able))
     finally:
         await client.close()
