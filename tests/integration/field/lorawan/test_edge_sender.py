@@ -167,14 +167,15 @@ def test_a_mission_that_cannot_be_reached_keeps_no_other_back() -> None:
     assert [reading.mission_id for reading in waiting(pending)] == ["default"]
 
 
-def test_one_refused_reading_costs_few_requests() -> None:
+@pytest.mark.parametrize("status", [400, 413, 415, 422])
+def test_one_refused_reading_costs_few_requests(status: int) -> None:
     asked: list[int] = []
 
     def edge(request: httpx.Request) -> httpx.Response:
         sensors = [reading["sensor_id"] for reading in json.loads(request.content)["readings"]]
         asked.append(len(sensors))
         if 77 in sensors:
-            return httpx.Response(422, json={"title": "no", "status": 422, "detail": "sensor 77: unknown"})
+            return httpx.Response(status, json={"title": "no", "status": status, "detail": "sensor 77: unknown"})
         return httpx.Response(200, json={"results": ["merged"] * len(sensors), "step": 3})
 
     pending = taken()
@@ -185,12 +186,16 @@ def test_one_refused_reading_costs_few_requests() -> None:
     assert len(asked) <= 2 * 7 + 1
 
 
-def test_readings_of_an_unknown_mission_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
-    problem = {"title": "no", "status": 404, "detail": "mission_id: unknown"}
+# 409: a mission that the edge cannot load from its store.
+@pytest.mark.parametrize("status", [404, 409])
+def test_readings_of_a_mission_that_the_edge_does_not_have_wait_and_are_logged_once(
+    status: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    problem = {"title": "no", "status": status, "detail": "mission_id: unknown"}
     pending = taken()
-    sender = edge_sender(pending, handler=lambda request: httpx.Response(404, json=problem), retry_s=0.0)
-    for _ in range(3):
-        sender.send_pending()
+    sender = edge_sender(pending, handler=lambda request: httpx.Response(status, json=problem), retry_s=0.0)
+    assert [sender.send_pending() for _ in range(3)] == [1.0, 1.0, 1.0]
+    assert counted(pending) == {"no_mission": 3}
     assert [record.message for record in caplog.records if record.levelname == "WARNING"] == [
         "the readings of mission default wait: mission_id: unknown"
     ]
@@ -207,3 +212,36 @@ def test_a_full_queue_is_the_capacity(capacity: int) -> None:
     pending = taken(queue=100.0, into=reading_buffer(packets_per_unit=capacity / 100))
     edge_sender(pending, handler=edge).send_pending()
     assert sent == [capacity]
+
+
+def test_a_mission_that_is_not_there_is_asked_for_after_the_pause_only_and_others_go_on() -> None:
+    asked: list[str] = []
+
+    def edge(request: httpx.Request) -> httpx.Response:
+        mission = request.url.path.split("/")[2]
+        asked.append(mission)
+        if mission == "default":
+            return httpx.Response(404, json={"title": "no", "status": 404, "detail": "mission_id: unknown"})
+        return httpx.Response(200, json={"results": ["merged"], "step": 3})
+
+    pending = taken()
+    [reading] = waiting(pending)
+    sender = edge_sender(pending, handler=edge, retry_s=3600.0)
+    for number in range(3):
+        pending.put_back([reading, replace(reading, mission_id=f"south-{number}")])
+        sender.send_pending()
+    assert asked == ["default", "south-0", "south-1", "south-2"]
+    assert waiting(pending) == [reading]
+
+
+def test_a_reading_by_a_clock_that_is_ahead_is_of_now_and_a_queue_beyond_the_wires_is_its_largest() -> None:
+    sent: list[dict[str, Any]] = []
+
+    def edge(request: httpx.Request) -> httpx.Response:
+        sent.extend(json.loads(request.content)["readings"])
+        return httpx.Response(200, json={"results": ["merged"], "step": 3})
+
+    pending = taken(queue=100_001, age_s=-50.0)
+    edge_sender(pending, handler=edge).send_pending()
+    assert [(reading["queue"], reading["age_s"]) for reading in sent] == [(100_000, 0.0)]
+    assert counted(pending) == {"merged": 1}
