@@ -72,10 +72,12 @@ def test_newer_beacons_count_and_show_arrivals_unless_a_visit_left_packets(step:
     belief.advance(step)
     ids, queue, seen = heard(belief, step)
     arrivals, since, base = belief.arrivals, belief.since[ids], belief.base[ids]
-    newer, passed = seen > belief.heard[ids], seen - since
+    # The queue before the visit from which a sensor's is known says less than that visit.
+    visited = belief.visited[ids]
+    newer, passed = (seen > belief.heard[ids]) & ~((seen <= visited) & (visited == since)), seen - since
     counted = newer & (belief.heard[ids] >= 0) & (passed > 0) & (queue < 60)
     expected = arrivals.rate[ids] * np.maximum(passed, 0)
-    counted &= ~((belief.visited[ids] == since) & (queue - base > expected + 4 * np.sqrt(expected) + 2))
+    counted &= ~((visited == since) & (queue - base > expected + 4 * np.sqrt(expected) + 2))
     arrived, watched, recent = arrivals.arrived.copy(), arrivals.watched.copy(), arrivals.recent.copy()
     came = np.maximum(queue - base, 0.0)[counted]
     arrived[ids[counted]] += came
