@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from unittest.mock import patch
 
 import pytest
 
+from shared.client.calls import Exchange
 from shared.client.edge_client import EdgeClient
-from shared.client.errors import EdgeRefused
+from shared.client.errors import EdgeError, EdgeRefused, EdgeUnreachable
 from shared.wire.problem import Problem
+from shared.wire.schemas import DecideRequest
 from shared.world.scenario import Scenario
 from simulator.flying.flight import fly
 from simulator.flying.pilots import EdgePilot, LocalPilot
@@ -82,6 +85,14 @@ def test_an_edge_that_fails_for_a_while(stub: EdgeStub, client: EdgeClient) -> N
     assert sent >= {d.decision_id for d in flight.decisions if d.decision_id is not None}
 
 
+def test_a_lost_edge_is_asked_once_for_each_decision_until_it_answers(stub: EdgeStub, client: EdgeClient) -> None:
+    # The client's two attempts, then single ones; after an answer two again.
+    stub.script = ["busy", "busy", "busy", "busy", "ok", "busy", "busy", "ok"]
+    flight = fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0), seed=0)
+    assert [d.source == "onboard" for d in flight.decisions] == [True] * 3 + [False, True] + [False] * 7
+    assert stub.request_count == 8 + 6
+
+
 def test_an_edge_that_restarted_gets_the_mission_again(stub: EdgeStub, client: EdgeClient) -> None:
     stub.script = ["ok", "ok", "ok", "forgot"]
     flight = fly(Site(SHORT), EdgePilot(client, "m-7", SHORT, seed=9), seed=9)
@@ -96,6 +107,32 @@ def test_a_decision_that_the_edge_has_lost_costs_its_outcome_alone(stub: EdgeStu
     with patch.object(client, "put_mission", side_effect=other):
         flight = fly(Site(SHORT), EdgePilot(client, "m-7", SHORT, seed=9), seed=9)
     assert all(d.source != "onboard" for d in flight.decisions)
+
+
+@pytest.mark.parametrize(
+    ("failure", "sent"),
+    [(EdgeRefused("url", Problem(detail="decision unknown"), 404), 3), (EdgeUnreachable("no edge"), 1)],
+)
+def test_an_outcome_that_is_refused_at_landing_keeps_no_other_back_and_a_lost_edge_gets_no_more(
+    failure: EdgeError, sent: int, client: EdgeClient
+) -> None:
+    pilot = EdgePilot(client, "m", SHORT, seed=0)
+    with patch.object(client, "feedback", side_effect=failure) as feedback:
+        fly(Site(SHORT), pilot, seed=0)
+    assert feedback.call_count == sent and pilot.last_error == str(failure)
+
+
+def test_an_outcome_that_the_edge_could_not_store_is_sent_again_at_landing(stub: EdgeStub, client: EdgeClient) -> None:
+    decide = client.decide
+
+    def without_a_disk_in_step_2(request: DecideRequest, attempts: int | None = None) -> Exchange:
+        exchange = decide(request, attempts)
+        return replace(exchange, response=exchange.response.model_copy(update={"stored": request.step != 2}))
+
+    with patch.object(client, "decide", side_effect=without_a_disk_in_step_2):
+        flight = fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0), seed=0)
+    again = [d.decision_id for d in flight.decisions if d.step == 1]
+    assert [f.decision_id for f in stub.feedbacks] == again + [d.decision_id for d in flight.decisions if d.step == 3]
 
 
 def test_losses_beyond_a_cost_are_the_highest_cost(stub: EdgeStub, client: EdgeClient) -> None:
@@ -154,6 +191,17 @@ def test_an_edge_that_comes_back_in_time_rejoins() -> None:
         assert waits and again[0].missions["m"] == pilot.spec
         velocities = [[d.velocity for d in flight.decisions if d.uav_id == uav] for uav in range(3)]
         assert [flown[:2] for flown in velocities] == [[3, 3]] * 3, "on board it keeps the edge's last velocity"
+
+
+def test_every_outage_is_waited_for_as_long_as_the_first(stub: EdgeStub) -> None:
+    stub.script = ["busy", "busy", "busy", "ok", "ok", "ok", "busy", "busy", "busy"]
+    with (
+        EdgeClient(stub.url, timeout_s=PATIENCE_S, attempts=1) as client,
+        patch.object(client, "wait_ready", wraps=client.wait_ready) as pauses,
+    ):
+        flight = fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0, reconnect_s=PATIENCE_S), seed=0)
+    assert [d.source == "onboard" for d in flight.decisions] == ([True] * 3 + [False] * 3) * 2
+    assert [pause.args for pause in pauses.call_args_list] == [(PATIENCE_S,)] * 2
 
 
 def test_an_edge_that_stays_away_costs_one_pause() -> None:
