@@ -13,6 +13,7 @@ from field.vehicles.field_run import doubts_of, flown_on
 from field.vehicles.field_uav import LINK_LOST, FieldUav
 from field.vehicles.mavlink_vehicle import VehicleState, mavlink_vehicle
 from field.vehicles.radio import Beacon, Collected, Spot
+from shared.world.trajectory import trajectories
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.plans.mission_path import DELAY, TAKEOFF, WAYPOINT, MissionItem, path_of
 from tests.integration.field.vehicles.test_field_flight import Counting, Trial, nobody
@@ -120,6 +121,36 @@ async def test_a_vehicle_whose_state_cannot_be_read_ends_no_flight() -> None:
     assert len([d for d in flown.decisions if d.uav_id != 2]) == 12
 
 
+async def test_a_uav_whose_telemetry_stops_at_its_waypoint_collects_a_step_further_along_its_path() -> None:
+    class Lost(StubVehicle):
+        async def state(self) -> VehicleState:
+            if self._clock.now() > 10.0:
+                raise VehicleError("no answer")
+            return await super().state()
+
+    class Noting(Counting):
+        async def collect(self, spot: Spot, sensor: int) -> Collected:
+            places[spot.uav, spot.step] = spot.position
+            return await super().collect(spot, sensor)
+
+    places: dict[tuple[int, int], tuple[float, float]] = {}
+    trial = Trial(steps=2)
+    trial.radio = Noting([(0, 0)] * 3)
+    trial.uavs[0] = FieldUav(0, Lost(trial.site, 0, trial.clock), trial.site)
+    flown = await trial.fly(nobody(), attempts=1)
+    assert flown.ended == {0: LINK_LOST}
+    path = trajectories(trial.site.scenario)[0]
+    assert [path.locate(places[0, step])[0] for step in range(2)] == pytest.approx([70.0, 140.0], abs=0.1)
+
+
+async def test_a_flight_ends_once_every_uav_has_landed() -> None:
+    trial = Trial()
+    for vehicle in trial.vehicles:
+        vehicle.lands_at_s = 35.0
+    flown = await trial.fly(nobody(), attempts=1)
+    assert flown.steps_flown == 4 and flown.ended == dict.fromkeys(range(3), "it lands") and not flown.undecided
+
+
 class Nonsense(Counting):
     def __init__(self, heard: Any, got: Any) -> None:
         super().__init__([])
@@ -143,6 +174,8 @@ FAIR = {0: Beacon(30, 40.0, -90.0, 0)}
         (None, Collected(5, failed=False)),
         ({99: Beacon(30, 40.0, -90.0, 0)}, Collected(5, failed=False)),
         ({-1: Beacon(30, 40.0, -90.0, 0)}, Collected(5, failed=False)),
+        ({0: Beacon(-1, 40.0, -90.0, 0)}, Collected(5, failed=False)),
+        ({0: Beacon(30, 40.0, -90.0, -1)}, Collected(5, failed=False)),
         ({0: Beacon(30, 40.0, -90.0, None)}, Collected(5, failed=False)),  # type: ignore[arg-type]
         (FAIR, None),
         (FAIR, Collected(-3, failed=False)),

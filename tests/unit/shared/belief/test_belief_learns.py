@@ -206,6 +206,16 @@ def test_no_radio_is_dead_where_something_else_explains_the_failures(told: dict[
     assert fails(6, **told).channel.failures.none
 
 
+def test_a_failure_some_steps_ago_says_nothing_of_the_link_that_is_measured_now() -> None:
+    told = {}
+    for step in (1, 2):
+        fleet = visited()
+        fleet.settle(0, 0, failed=True)
+        report(fleet, step)
+        told[step] = not fleet.channel.failures.none
+    assert told == {1: True, 2: False}
+
+
 def test_a_report_that_comes_again_teaches_nothing() -> None:
     fleet = visited(excess_db=np.full(3, 5.0))
     fleet.settle(0, 0, failed=True)

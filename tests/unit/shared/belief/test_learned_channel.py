@@ -85,6 +85,14 @@ def test_one_transmission_that_succeeds_shows_that_the_radio_works() -> None:
     assert failures.alive()[1] > 0.5
 
 
+def test_a_failure_within_half_a_decibel_of_the_threshold_says_nothing_of_the_radio() -> None:
+    learned = channel()
+    assert not learned.transmitted(1, True, PAPER.path_loss_limit_db - 0.5)
+    assert learned.failures.none
+    assert learned.transmitted(1, True, PAPER.path_loss_limit_db - 0.6)
+    assert not learned.failures.none
+
+
 def test_forged_failures_are_forgotten_however_many_they_are() -> None:
     failures = RadioFailures(3)
     for _ in range(10_000):
@@ -109,8 +117,9 @@ def test_half_the_packets_that_a_link_should_move_are_half_the_rate() -> None:
         learned.moved(30.0, before=60.0, link=60, slack=8.0)
     assert learned.share == pytest.approx(0.5, abs=0.1)
     assert 25 <= learned.links(HERE, DISTANCES).likely[0, 0] <= 35
-    # An emptied queue tells no more than that the rate was enough for it.
-    learned.moved(20.0, before=20.0, link=60, slack=8.0)
+    # Emptied queues tell no more than that the rate was enough for them.
+    for _ in range(8):
+        learned.moved(20.0, before=20.0, link=60, slack=8.0)
     assert learned.share == pytest.approx(0.5, abs=0.1)
     for _ in range(8):
         learned.moved(60.0, before=60.0, link=60, slack=8.0)

@@ -92,3 +92,9 @@ def test_as_many_radios_die_as_the_scenario_says_at_steps_of_the_whole_mission()
     dead = dies[dies <= scenario.steps]
     assert len(dead) == 900
     assert set(dead.tolist()) == set(range(1, scenario.steps + 1))
+
+
+def test_a_loss_is_one_that_a_report_can_have_whatever_its_excess() -> None:
+    channel = truth(CROWD.model_copy(update={"shadowing_db": 8.0})).channel
+    links = channel.at(np.full(2, 100.0), np.array([-500.0, 500.0]), 1.0)
+    assert links.loss_db.tolist() == [0.0, 400.0]

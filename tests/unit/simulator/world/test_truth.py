@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario
 from simulator.world.environment import PipelineWorld
-from simulator.world.sensors import Streams
+from simulator.world.sensors import StepNoise, Streams
 from simulator.world.truth import Truth
 
 CROWD = Scenario(name="crowd", sensors=2000)
@@ -44,6 +47,15 @@ def test_positions_are_reported_with_an_error_of_the_scenarios_size() -> None:
     after, *_ = world.step(dict.fromkeys(world.agents, (0, 0)))
     again = np.array([after[agent]["position"] for agent in world.agents]) - world.fleet.positions
     assert not np.any(again == errors)
+
+
+def test_no_position_is_reported_farther_off_than_five_deviations_on_an_axis() -> None:
+    class Wild(StepNoise):
+        def normal(self, instant: int, shape: tuple[int, ...]) -> FloatArray:
+            return np.array([[7.0, -9.0], [-0.5, 2.0]])
+
+    world = replace(truth(Scenario(position_noise_m=3.0)), position_noise=Wild(np.zeros((), dtype=np.int64)))
+    assert world.reported(np.full((2, 2), 100.0), 1).tolist() == [[115.0, 85.0], [98.5, 106.0]]
 
 
 def test_other_draws_do_not_shift_those_that_the_model_knows() -> None:
