@@ -72,6 +72,29 @@ def test_ranges_that_contradict_themselves() -> None:
         Scenario(initial_queue_max=0.2)
 
 
+def test_every_radio_may_die_and_all_uavs_but_one_may_leave() -> None:
+    assert Scenario(sensors=4, dead_radios=4, uavs=3, departures=2).dead_radios == 4
+    with pytest.raises(ValidationError, match="dead_radios is 5, there are 4 sensors"):
+        Scenario(sensors=4, dead_radios=5)
+    with pytest.raises(ValidationError, match="departures is 3 of 3 UAVs: at least one has to stay"):
+        Scenario(uavs=3, departures=3)
+
+
+def test_surveyed_sites_are_in_the_area_or_on_its_edge_one_a_sensor() -> None:
+    surveyed: dict[str, Any] = {"layout": "surveyed", "area_m": 500.0, "sensors": 2}
+    assert len(Scenario(**surveyed, sites=((0.0, 500.0), (500.0, 0.0))).sites) == 2
+    for outside in ((500.1, 0.0), (0.0, -0.1)):
+        with pytest.raises(ValidationError, match=r"a position outside the area of 0\.\.500 m"):
+            Scenario(**surveyed, sites=((0.0, 500.0), outside))
+    with pytest.raises(ValidationError, match="a site for each of 2 sensors, sites has 1"):
+        Scenario(**surveyed, sites=((0.0, 500.0),))
+
+
+def test_every_uav_has_a_route_or_none_has() -> None:
+    with pytest.raises(ValidationError, match="routes has 1 trajectories for 2 UAVs"):
+        Scenario(uavs=2, routes=(((0.0, 0.0), (9.0, 0.0)),))
+
+
 def test_a_scenario_cannot_be_changed() -> None:
     with pytest.raises(ValidationError, match="frozen"):
         scenario_named("paper").sensors = 3  # type: ignore[misc]

@@ -104,6 +104,13 @@ def test_a_circle_is_not_left() -> None:
     assert circle.first_breach([(4, 4), (6, 6)]) is None and circle.first_breach([(4, 4), (7, 7)]) == 1
 
 
+def test_a_circles_boundary_belongs_to_its_area() -> None:
+    fence, area = (Fence(role, ((5.0, 5.0),), 2.0) for role in ("fence", "no_fly"))
+    assert fence.allows((7.0, 5.0)) and not fence.allows((7.1, 5.0))
+    assert not area.allows((7.0, 5.0)) and area.allows((7.1, 5.0))
+    assert area.first_breach([(0.0, 3.0), (9.0, 3.0)]) == 1, "it touches the circle from outside"
+
+
 RING = [[41.49, 39.94], [41.52, 39.94], [41.52, 39.97], [41.49, 39.97], [41.49, 39.94]]
 
 
