@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import pytest
+
+from field.errors import VehicleError
 from field.vehicles.field_uav import NO_POSITION, FieldUav
 from field.vehicles.mavlink_vehicle import VehicleState
 from simulator.sites.files.world_folder import site_from_folder
@@ -79,3 +82,15 @@ async def test_a_uav_without_a_position_reports_no_height() -> None:
     assert uav.of_itself() == {"battery_percent": 80.0, "height_m": 100.0}
     assert await reasons(uav, vehicle, {"battery_percent": 79.0, "position": None}) == [NO_POSITION]
     assert uav.of_itself() == {"battery_percent": 79.0}
+
+
+async def test_a_uav_that_refused_to_wait_does_not_count_as_waiting_and_is_told_again() -> None:
+    uav, vehicle = told_uav()
+    await uav.update(1.0)
+    vehicle.deaf = True
+    for _ in range(2):
+        with pytest.raises(VehicleError, match="stub 0 did not do hold"):
+            await uav.command(0)
+        assert not uav.waits
+    await uav.resume_mission()
+    assert vehicle.commands == ["hold", "hold"]
