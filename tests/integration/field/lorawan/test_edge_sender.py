@@ -13,6 +13,7 @@ import pytest
 
 from field.lorawan.edge_sender import EdgeSender
 from field.lorawan.pending_readings import PendingReading, ReadingBuffer
+from shared.wire.readings import MAX_READINGS
 from tests.support.lorawan_messages import chirpstack_up, packed
 from tests.unit.field.lorawan.test_pending_readings import reading_buffer
 
@@ -245,3 +246,18 @@ def test_a_reading_by_a_clock_that_is_ahead_is_of_now_and_a_queue_beyond_the_wir
     edge_sender(pending, handler=edge).send_pending()
     assert [(reading["queue"], reading["age_s"]) for reading in sent] == [(100_000, 0.0)]
     assert counted(pending) == {"merged": 1}
+
+
+def test_readings_of_more_sensors_than_a_request_may_have_are_all_sent() -> None:
+    asked: list[int] = []
+
+    def edge(request: httpx.Request) -> httpx.Response:
+        asked.append(len(json.loads(request.content)["readings"]))
+        return httpx.Response(200, json={"results": ["merged"] * asked[-1], "step": 3})
+
+    pending = taken()
+    [reading] = waiting(pending)
+    pending.put_back([replace(reading, sensor_id=sensor) for sensor in range(MAX_READINGS + 1)])
+    edge_sender(pending, handler=edge).send_pending()
+    assert counted(pending) == {"merged": MAX_READINGS + 1}
+    assert sum(asked) == MAX_READINGS + 1 and max(asked) <= MAX_READINGS
