@@ -218,7 +218,7 @@ class FieldFlight:
         collected = {}
         for leg in legs:
             if leg.uav.unavailable_reason in (LINK_LOST, NO_POSITION):
-                leg.uav.dead_reckon(leg.choice.velocity, self._scenario.step_s)
+                leg.uav.dead_reckon(leg.start_m + leg.choice.velocity * self._scenario.step_s)
             else:
                 decided_m, flown_m = self.result.metres.get(leg.uav.index, (0.0, 0.0))
                 decided_m += leg.choice.velocity * self._scenario.step_s

@@ -176,10 +176,10 @@ class FieldUav:
         """The way along its trajectory since its first position, metres."""
         return self._follower.flown_m
 
-    def dead_reckon(self, velocity: int, seconds: float) -> None:
-        """Assume the position along its path after these seconds; for a UAV whose telemetry has stopped."""
+    def dead_reckon(self, flown_m: float) -> None:
+        """Assume the position where it has flown so many metres; for a UAV whose telemetry has stopped."""
         assert self._site.frame is not None, "a site with vehicles has a place on the globe"
-        self._here = self._follower.ahead(velocity * seconds)
+        self._here = self._follower.ahead(max(0.0, flown_m - self.flown_m))
         longitude, latitude = self._site.frame.degrees([self._here])[0].tolist()
         self._degrees = longitude, latitude
 

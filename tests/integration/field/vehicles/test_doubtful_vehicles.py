@@ -121,10 +121,11 @@ async def test_a_vehicle_whose_state_cannot_be_read_ends_no_flight() -> None:
     assert len([d for d in flown.decisions if d.uav_id != 2]) == 12
 
 
-async def test_a_uav_whose_telemetry_stops_at_its_waypoint_collects_a_step_further_along_its_path() -> None:
+@pytest.mark.parametrize("stops_s", [10.0, 12.5, 15.0, 19.0])
+async def test_a_uav_whose_telemetry_stops_collects_a_step_further_along_its_path(stops_s: float) -> None:
     class Lost(StubVehicle):
         async def state(self) -> VehicleState:
-            if self._clock.now() > 10.0:
+            if self._clock.now() > stops_s:
                 raise VehicleError("no answer")
             return await super().state()
 
