@@ -50,7 +50,7 @@ EXPERIMENT = Experiment(
     heuristics=tuple(name + speed for name in _HEURISTICS for speed in ("", "_fast")) + ("eof", "wqcs"),
     notes=(
         "With the adapter, mode llm has the compact prompt, the fleet's belief and the features `reach`. Its rows are "
-        "shuffled, and neither planner, verifier nor critic takes part. Without it, the prompt is the paper's.",
+        "shuffled, and neither planner, verifier nor critic takes part. Without it, the prompt is the paper's. "
         "The LLM's own weights stay as they are; the adapter was trained on the planner's decisions in worlds of other "
         "seeds. What it decides is learned before the flight, not in the prompt's context.",
     ),
