@@ -61,9 +61,9 @@ def main() -> int:
 
 def usable() -> bool:
     """Whether .venv is of this folder and of this version of Python: no copy of another checkout's, and with pip."""
-    told = "import pip, sys; print(sys.version_info[:2], sys.prefix)"
+    script = "import pip, sys; print(sys.version_info[:2], sys.prefix)"
     try:
-        found = subprocess.run([PYTHON, "-c", told], capture_output=True, text=True, check=False).stdout.strip()
+        found = subprocess.run([PYTHON, "-c", script], capture_output=True, text=True, check=False).stdout.strip()
         # Its first lines name the interpreter that runs it.
         pip = (VENV / "bin" / "pip").read_text()
     except OSError:

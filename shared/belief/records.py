@@ -146,8 +146,7 @@ def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief)
         belief.drift.tops[uav.uav_id] = max(1, round(uav.top_speed_mps))
     belief.hear(reported.ids, reported.places, reported.beacon, reported.queue, reported.battery)
     fresh = reported.beacon == step
-    measured = NOTHING_MEASURED
-    if not delayed:
-        measured = belief.measure(uav.uav_id, reported.ids[fresh], reported.gain[fresh])
+    gains = reported.ids[fresh], reported.gain[fresh]
+    measured = NOTHING_MEASURED if delayed else belief.measure(uav.uav_id, *gains)
     records.hear(reported.ids, reported.beacon, reported.queue)
     return measured

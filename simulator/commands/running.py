@@ -58,9 +58,10 @@ def _remedy(error: Exception) -> str:
 
 @contextmanager
 def ends_interrupt() -> Iterator[None]:
-    """Within the context, SIGTERM and SIGHUP raise KeyboardInterrupt, so that `docker stop` and a closed terminal
-    leave a result as Ctrl-C does. One that is ignored, as SIGHUP is under nohup, stays ignored."""
+    """Within the context, SIGTERM and SIGHUP raise KeyboardInterrupt: they leave a result as Ctrl-C does.
 
+    A signal that is ignored, as SIGHUP is under nohup, stays ignored.
+    """
     terminals = [each for each in (1, 2) if os.isatty(each)]
 
     def interrupt(signum: int, frame: FrameType | None) -> None:

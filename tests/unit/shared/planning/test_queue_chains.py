@@ -88,5 +88,5 @@ def test_a_large_queue_is_as_fine_at_its_upper_end(capacity: int, room: float) -
         lost.append(float(odds @ made.lost[step, 0]))
         odds = odds @ transitions(made.arrive[step, 0])
     np.testing.assert_allclose(lost, simulated(capacity - room, 5.0, 0.0, capacity, 3), rtol=0.1, atol=0.25)
-    # Far from full nothing is lost, and what came since the beacon fills what lies below the levels first.
+    # A queue that is far from full is at the lowest level.
     assert chains(capacity / 3, 5.0, 5.0, capacity).start[0, 0] == pytest.approx(1.0)
