@@ -13,14 +13,13 @@ import math
 import os
 import re
 import ssl
-import time
 from collections.abc import Mapping
-from email.utils import parsedate_to_datetime
 from typing import Any
 
 import aiohttp
 
 from service.llm.answers import Completion, NoDecision, TokenPosition
+from shared.kit.retry_after import asked_pause_s
 
 _MOST = 200
 _READ = 2 * 1024
@@ -97,15 +96,8 @@ def _message(answer: Any) -> str:
 
 def pause_of(headers: Mapping[str, str]) -> float | None:
     """Seconds of a refusal's ``Retry-After``, 0.1 to 480; None if there is none that can be read."""
-    value = headers.get("Retry-After", "")
-    try:
-        seconds = float(value)
-    except ValueError:
-        try:
-            seconds = parsedate_to_datetime(value).timestamp() - time.time()
-        except (ValueError, OverflowError):
-            return None
-    return min(max(seconds, _SHORTEST_PAUSE_S), _LONGEST_PAUSE_S) if math.isfinite(seconds) else None
+    seconds = asked_pause_s(headers)
+    return None if seconds is None else min(max(seconds, _SHORTEST_PAUSE_S), _LONGEST_PAUSE_S)
 
 
 def connection_fault(error: aiohttp.ClientError | OSError | ValueError) -> str:

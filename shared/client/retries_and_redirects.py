@@ -4,18 +4,16 @@ A request waits only in the two functions given to :class:`Requests`: the asynch
 loop, and the blocking client functions that never suspend.
 """
 
-import math
 import random
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from email.utils import parsedate_to_datetime
 from typing import TypeVar
 
 import httpx
 from pydantic import BaseModel, ValidationError
 
 from shared.client.errors import EdgeProtocolError, EdgeRefused, EdgeUnreachable, InvalidEdgeUrl
+from shared.kit.retry_after import asked_pause_s
 from shared.wire.problem import Problem
 
 RETRIED_STATUS = frozenset({408, 429, 502, 503, 504})
@@ -119,7 +117,7 @@ class Requests:
         answer = await self._send(self.base_url, send)
         if answer.status_code != MISDIRECTED:
             return answer
-        owner, retry_after_s = _owner(answer), _retry_after(answer)
+        owner, retry_after_s = _owner(answer), asked_pause_s(answer.headers)
         if owner is None:
             raise TryAgain("another edge has the mission, and gave no address", retry_after_s)
         try:
@@ -128,7 +126,7 @@ class Requests:
             # An owner that has ended keeps its missions from other edges until their leases end.
             raise TryAgain(f"{owner}: {again.cause}", again.retry_after_s or retry_after_s) from again
         if answer.status_code == MISDIRECTED:
-            raise TryAgain(f"neither this edge nor {owner} has the mission", _retry_after(answer))
+            raise TryAgain(f"neither this edge nor {owner} has the mission", asked_pause_s(answer.headers))
         return answer
 
     async def _send(self, base_url: str, send: Send) -> httpx.Response:
@@ -142,7 +140,7 @@ class Requests:
             raise EdgeProtocolError(f"{url} answered with a broken body: {error}") from error
         status = answer.status_code
         if status in RETRIED_STATUS:
-            raise TryAgain(f"{status} {_problem(answer).detail}", _retry_after(answer))
+            raise TryAgain(f"{status} {_problem(answer).detail}", asked_pause_s(answer.headers))
         if status < 300 or status in (NOT_MODIFIED, MISDIRECTED):
             return answer
         if status < 400 or answer.text.lstrip()[:1] == "<":
@@ -181,18 +179,3 @@ def _problem(answer: httpx.Response) -> Problem:
         lines = answer.text.strip().splitlines()
         detail = lines[0][:200] if lines else answer.reason_phrase
         return Problem(title=answer.reason_phrase, status=answer.status_code, detail=detail)
-
-
-def _retry_after(answer: httpx.Response) -> float | None:
-    text = answer.headers.get("Retry-After")
-    if text is None:
-        return None
-    try:
-        seconds = float(text)
-    except ValueError:
-        try:
-            when = parsedate_to_datetime(text)
-        except (ValueError, OverflowError):
-            return None
-        seconds = (when.replace(tzinfo=when.tzinfo or UTC) - datetime.now(UTC)).total_seconds()
-    return max(0.0, seconds) if math.isfinite(seconds) else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import pytest
@@ -100,3 +101,15 @@ def test_a_pause_is_bounded_and_nonsense_is_none(value: str, seconds: float | No
 def test_a_pause_may_be_a_date() -> None:
     assert pause_of({"Retry-After": "Fri, 31 Dec 2100 23:59:59 GMT"}) == 480.0
     assert pause_of({"Retry-After": "Fri, 31 Dec 1999 23:59:59 GMT"}) == 0.1
+
+
+def test_a_date_of_an_unknown_zone_is_read_as_utc(monkeypatch: pytest.MonkeyPatch) -> None:
+    """RFC 5322 writes -0000 where the zone is unknown; the machine's own zone says nothing about the server."""
+    monkeypatch.setenv("TZ", "Etc/GMT+12")
+    time.tzset()
+    try:
+        past = time.strftime("%a, %d %b %Y %H:%M:%S -0000", time.gmtime(time.time() - 60))
+        assert pause_of({"Retry-After": past}) == 0.1
+    finally:
+        monkeypatch.undo()
+        time.tzset()
