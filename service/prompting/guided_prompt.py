@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from service.prompting.candidates import CandidateSet, Letters, Viewpoint
 from service.prompting.paper_prompt import STATIC_BLOCKS, Template
 from service.prompting.prompt import Prompt, note_block
-from service.prompting.rows import Cells, cells, row
+from service.prompting.rows import Cells, cells
 from service.prompting.unpruned_state import UnprunedState
 from shared.features.augmented_state import Reach, State
 from shared.world.scenario import Scenario
@@ -93,7 +93,7 @@ class GuidedTemplate(Template):
 
     def choice_prompt(self, candidates: CandidateSet, state: State, experiences: Sequence[str]) -> Prompt:
         """The prompt for one decision; the parameters are those of :meth:`Template.prompt`."""
-        return Prompt(self.static, "".join(experiences), candidates.rows, UnprunedState(state, row))
+        return Prompt(self.static, "".join(experiences), candidates.rows, UnprunedState(state))
 
     def fleet_prompts(
         self, uavs: Mapping[int, tuple[CandidateSet, State]], experiences: Sequence[str]
@@ -104,7 +104,7 @@ class GuidedTemplate(Template):
         """
         shares = {}
         for uav, (candidates, state) in uavs.items():
-            unpruned = UnprunedState(state, row, _list(uav, ""))
+            unpruned = UnprunedState(state, _list(uav, ""))
             shares[uav] = Prompt("", "", _list(uav, candidates.numbered_rows()), unpruned)
         uav, first = next(iter(shares.items()))
         shares[uav] = Prompt(self.fleet_static, "".join(experiences), first.state, first.uncompressed)

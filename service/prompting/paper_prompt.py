@@ -84,7 +84,7 @@ class Template:
             static=self.static,
             experiences="".join(experiences),
             state=last + "".join(map(row, cells(state, kept_rows))),
-            uncompressed=UnprunedState(state, row, last),
+            uncompressed=UnprunedState(state, last),
             kept=kept_rows,
         )
 

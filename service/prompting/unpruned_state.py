@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from service.prompting.rows import ALWAYS_KNOWN, UNKNOWN, Cells, whole_numbers
+from service.prompting.rows import ALWAYS_KNOWN, UNKNOWN, row, whole_numbers
 from shared.features.augmented_state import State
 
 # The placeholder for a number while the text around it is counted: one token, and not zero, which has no sign.
@@ -25,24 +25,11 @@ class UnprunedState:
 
     Args:
         state: the sensors.
-        write: writes one sensor's line, which ends with a line break.
         head: whole lines above the rows.
     """
 
     state: State
-    write: Callable[[Cells], str]
     head: str = ""
-
-    @property
-    def text(self) -> str:
-        """The block's text."""
-        names, numbers = whole_numbers(self.state)
-        unknown = ~self.state.heard[:, None] & _columns(names)[0]
-        lines = [
-            self.write({n: UNKNOWN if u else str(v) for n, v, u in zip(names, row, missing, strict=True)})
-            for row, missing in zip(numbers.T.tolist(), unknown.tolist(), strict=True)
-        ]
-        return self.head + "".join(lines)
 
     def tokens_by_row(self, count: Callable[[str], int]) -> NDArray[np.int64]:
         """``count(line)`` of the sensors' lines ``(J,)``; o200k_base splits digits and lines as this does."""
@@ -55,7 +42,7 @@ class UnprunedState:
         kinds = place_values @ signs
         tokens = np.empty_like(kinds)
         for kind in set(kinds.tolist()):
-            tokens[kinds == kind] = count(_example_row(self.write, names, kind))
+            tokens[kinds == kind] = count(_example_row(names, kind))
         # The tokenizer makes one token of every three digits.
         while (above := sizes >= longer).any():
             tokens, longer = tokens + above.sum(axis=0), longer * 1000
@@ -69,7 +56,7 @@ def _columns(names: tuple[str, ...]) -> tuple[NDArray[np.bool_], NDArray[np.int6
 
 
 @lru_cache(maxsize=256)
-def _example_row(write: Callable[[Cells], str], names: tuple[str, ...], kind: int) -> str:
+def _example_row(names: tuple[str, ...], kind: int) -> str:
     """A row whose known numbers have one digit.
 
     ``kind`` has a digit to the base 3 for each column, the first one's last: 1 negative, 2 unknown, 0 any other.
@@ -78,4 +65,4 @@ def _example_row(write: Callable[[Cells], str], names: tuple[str, ...], kind: in
     for name in names:
         kind, sign = divmod(kind, 3)
         cells[name] = (_PLACEHOLDER, f"-{_PLACEHOLDER}", UNKNOWN)[sign]
-    return write(cells)
+    return row(cells)

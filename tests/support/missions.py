@@ -7,6 +7,8 @@ from typing import Any
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
 from service.mission.mission import Mission
+from service.prompting.rows import ALWAYS_KNOWN, UNKNOWN, row, whole_numbers
+from shared.features.augmented_state import State
 from shared.wire.schemas import MissionSpec, SensorColumns, UavState
 from shared.world.scenario import SCENARIOS
 
@@ -48,3 +50,12 @@ def uav(
 
 def attended(mission: Mission, state: UavState, step: int = 0) -> AttendedState:
     return AttendedState.of(mission, state, step)
+
+
+def written_rows(state: State) -> list[str]:
+    """The line of every sensor; numbers that a beacon must say are unknown where none was heard."""
+    names, numbers = whole_numbers(state)
+    return [
+        row({n: str(v) if heard or n in ALWAYS_KNOWN else UNKNOWN for n, v in zip(names, values, strict=True)})
+        for values, heard in zip(numbers.T.tolist(), state.heard.tolist(), strict=True)
+    ]

@@ -20,7 +20,6 @@ from service.llm.request_bodies import constrain_labels
 from service.mission.mission import Mission
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
-from service.prompting.rows import row
 from service.prompting.unpruned_state import UnprunedState
 from shared.world.step_rule import Action
 from tests.support.missions import PAPER, attended, mission, uav
@@ -233,7 +232,7 @@ def test_a_server_that_hangs_on_the_probe_is_asked_one_by_one(
 
 def test_what_is_left_of_a_word_is_the_llms_word() -> None:
     """A velocity forbidden meanwhile counts as the nearest that is offered; of sensors given away nothing is left."""
-    prompt = Prompt("", "", "", UnprunedState(attended(mission(), uav()).state, row))
+    prompt = Prompt("", "", "", UnprunedState(attended(mission(), uav()).state))
     word = LlmAdvice(
         prompt, {Action(1, 9): 0.3, Action(1, 2): 0.1, Action(4, 7): 0.6}, None, None, calibrated=False, model=None
     )

@@ -24,7 +24,6 @@ from service.live.broadcaster import MAX_LISTENERS
 from service.live.recent_decisions import RecentDecisions
 from service.mission.events import Settled
 from service.prompting.prompt import Prompt
-from service.prompting.rows import row
 from service.prompting.unpruned_state import UnprunedState
 from service.storage.rows import decode, encode, pack
 from shared.wire.schemas import DecideResponse, Outcome, Tokens
@@ -337,7 +336,7 @@ def answer_of(decision_id: str, mission_id: str = "test") -> DecideResponse:
 
 
 def prompt_of(state: str) -> Prompt:
-    return Prompt("static", "", state, UnprunedState(attended(mission(), uav()).state, row))
+    return Prompt("static", "", state, UnprunedState(attended(mission(), uav()).state))
 
 
 def test_what_is_kept_is_bounded_in_number_and_in_characters() -> None:

@@ -12,7 +12,7 @@ from service.prompting.prompt import Prompt
 from shared.wire.schemas import MissionSpec, Outcome, PromptStyle
 from shared.world.scenario import SCENARIOS
 from shared.world.step_rule import Action
-from tests.support.missions import PAPER, attended, mission, uav
+from tests.support.missions import PAPER, attended, mission, uav, written_rows
 
 
 def flown(steps: int = 3, spec: MissionSpec | None = None, **settings: Any) -> list[Prompt]:
@@ -71,18 +71,17 @@ def test_rows_are_sorted_by_score_and_say_what_is_known() -> None:
     m.records.visits[0] = 4
     view = attended(m, uav(step=6, queue=[30.0, None, 60.0, 15.0]), 6)
     prompt = m.template.prompt(view.state, view.shown(), [])
-    assert prompt.uncompressed.text.splitlines() == (
-        lines := [
-            "UAV at 500,500",
-            "0,30,50,-90,0,2,25,0",
-            "1,?,?,?,100,6,?,?",
-            "2,60,50,-90,200,6,100,100",
-            "3,15,50,-90,300,6,13,0",
-        ]
-    )
-    waypoint, *rows = prompt.state.splitlines()
-    assert waypoint == lines[0]
-    assert rows == [lines[1 + sensor] for sensor in view.kept_ids]
+    lines = written_rows(view.state)
+    assert [line.rstrip() for line in lines] == [
+        "0,30,50,-90,0,2,25,0",
+        "1,?,?,?,100,6,?,?",
+        "2,60,50,-90,200,6,100,100",
+        "3,15,50,-90,300,6,13,0",
+    ]
+    assert prompt.uncompressed.head == "UAV at 500,500\n"
+    waypoint, *rows = prompt.state.splitlines(keepends=True)
+    assert waypoint == prompt.uncompressed.head
+    assert rows == [lines[sensor] for sensor in view.kept_ids]
 
 
 def test_experiences_stand_between_static_and_state() -> None:

@@ -9,13 +9,12 @@ import pytest
 import tiktoken
 
 from service.config.settings import Settings
-from service.prompting.rows import row
 from service.prompting.token_accounting import TokenCounter, price_usd
 from service.prompting.tokenizer import VocabularyDamaged, encoding, ensure_vocabulary
 from service.prompting.unpruned_state import UnprunedState
 from shared.wire.schemas import Features, MissionSpec
 from shared.world.scenario import Scenario
-from tests.support.missions import attended, mission, uav
+from tests.support.missions import attended, mission, uav, written_rows
 
 COUNTER = TokenCounter(Settings().cache_dir)
 
@@ -93,11 +92,10 @@ def test_the_uncompressed_state_is_counted_as_if_it_were_written(features: Featu
     view = attended(m, uav(step=3000, x=[10 ** drawn.uniform(0, 6) for _ in queue], queue=queue), 3000)
     experiences = [f"{n},{n * n},-{n * 7},5,{n % 11} > {n} 9: {n / 10}\n" for n in range(0, 30_000, 977)]
     prompt = m.template.prompt(view.state, view.shown(), experiences)
-    tokens, whole = COUNTER.account(prompt), prompt.uncompressed
-    assert len(whole.text.splitlines()) >= 300
+    tokens, lines = COUNTER.account(prompt), written_rows(view.state)
+    assert len(lines) == 300
     assert tokens.experiences == COUNTER.count(prompt.experiences)
-    assert tokens.state_uncompressed == COUNTER.count(whole.text)
+    assert tokens.state_uncompressed == COUNTER.count(prompt.uncompressed.head + "".join(lines))
     assert (prompt.kept, tokens.state) == (view.shown(), COUNTER.count(prompt.state))
     assert COUNTER.account(replace(prompt, kept=None)) == tokens
-    rows = UnprunedState(view.state, row)
-    assert rows.tokens_by_row(COUNTER.count).tolist() == [COUNTER.count(f"{line}\n") for line in rows.text.splitlines()]
+    assert UnprunedState(view.state).tokens_by_row(COUNTER.count).tolist() == [COUNTER.count(line) for line in lines]
