@@ -90,7 +90,6 @@ class Trust:
         self._prior = {name: weight / total for name, weight in prior.items()}
         self.weights = dict(self._prior)
         self._surprise = 0.0
-        self.updates = 0
 
     def among(self, names: Mapping[str, object]) -> dict[str, float]:
         """The weights of these advisers, scaled to sum to 1."""
@@ -130,14 +129,12 @@ class Trust:
         own = {name: (1.0 - _SHARE) * weight / total for name, weight in updated.items()}
         shifted = {name: advising * (own[name] + _SHARE * self._prior[name] / prior) for name in own}
         self.weights = {**self.weights, **shifted}
-        self.updates += 1
 
     def state_dict(self) -> dict[str, Any]:
         """The weights, the mean surprise and the pending advice, as copies."""
         return {
             "weights": dict(self.weights),
             "surprise": self._surprise,
-            "updates": self.updates,
             "open": [(name, advice._asdict()) for name, advice in self.open.items()],
         }
 
@@ -145,7 +142,7 @@ class Trust:
         """Restore a state; one of other advisers is ignored."""
         if state["weights"].keys() != self._prior.keys():
             return
-        self.weights, self._surprise, self.updates = state["weights"], state["surprise"], state["updates"]
+        self.weights, self._surprise = state["weights"], state["surprise"]
         self.open.clear()
         for name, advice in state["open"]:
             self.open[name] = Advice(**advice)

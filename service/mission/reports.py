@@ -3,6 +3,7 @@
 A report may leave out what the UAV's reference report or an earlier report has (uplink ``delta``).
 """
 
+import logging
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -19,11 +20,14 @@ from shared.world.scenario import Scenario
 from shared.world.trajectory import progress_of, trajectories
 
 AnyReport = TypeVar("AnyReport", bound=UavState)
+log = logging.getLogger(__name__)
 
 # The columns of a reference report, in this order.
 _COLUMNS = ("id", "queue", "battery", "channel_gain", "last_seen")
 # A UAV and its sensors within so many metres of each other are a pipeline in degrees.
 _DEGREES_APART = 2.0
+# A report of step 0 after more steps is no late one: its fleet begins again, and the belief is that of later steps.
+_STEPS_BACK = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,10 +124,9 @@ class Reports:
         A fleet may be out of contact for as long as its scenario lasts. The first report may be of any step: an edge
         that lost its missions meets them in mid-flight, and fleets fly on past their scenario's last step.
         """
-        ahead = max(MAX_STEPS_APART, self._scenario.steps)
-        if step <= ahead:
-            return
-        newest = self._belief.newest
+        ahead, newest = max(MAX_STEPS_APART, self._scenario.steps), self._belief.newest
+        if step == 0 and newest is not None and newest > _STEPS_BACK:
+            log.warning("mission %s: step 0 after step %d: to fly it again, DELETE it first", self._mission_id, newest)
         if newest is not None and step > newest + ahead:
             raise Refused(
                 "step",

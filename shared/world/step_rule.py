@@ -88,6 +88,7 @@ def arrive(queue: Any, arrived: Any, capacity: int) -> tuple[Any, Any]:
     return left, filled - left
 
 
+@lru_cache
 def least_joules_a_packet(scenario: Scenario) -> float:
     """The energy of one packet over the shortest link; a sensor with less can transmit nothing."""
     return float(joules_a_packet(rate_bps(0.0, scenario), scenario))

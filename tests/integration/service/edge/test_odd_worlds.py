@@ -50,6 +50,21 @@ def test_a_report_from_the_future_does_not_blind_a_mission(edge: Edge, report: R
     assert shown["step"] == 5001 and shown["queue"][:4] == [59.0] * 4
 
 
+def test_a_fleet_that_begins_again_in_the_same_mission_is_reported(
+    edge: Edge, report: Report, caplog: pytest.LogCaptureFixture
+) -> None:
+    client = edge()
+    for step, uav in ((0, 0), (3, 0), (0, 1), (4, 0)):
+        assert client.post("/decide", json=report(step=step, uav_id=uav)).status_code == 200
+    assert "DELETE" not in caplog.text
+    assert client.post("/decide", json=report(step=0)).status_code == 200
+    assert "mission test: step 0 after step 4: to fly it again, DELETE it first" in caplog.text
+    caplog.clear()
+    client.delete("/missions/test").raise_for_status()
+    assert client.post("/decide", json=report(step=0)).status_code == 200
+    assert "DELETE" not in caplog.text
+
+
 @pytest.mark.parametrize(("steps", "away"), [(30, 64), (500, 500)])
 def test_a_fleet_that_was_out_of_contact_comes_back(edge: Edge, report: Report, steps: int, away: int) -> None:
     client = edge()
