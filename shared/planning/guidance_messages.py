@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal, Self
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from shared.planning.orders import MAX_WISHES, Clock, Guidance, OrderName
 from shared.wire.schemas import MissionId, Note
@@ -15,8 +15,6 @@ EndOfOrder = Literal["its own end", "withdrawn", "replaced"]
 
 class OrderRecord(Wire):
     """An order that was in force, from when to when; it ends where ``until`` is set."""
-
-    model_config = ConfigDict(extra="ignore")
 
     name: OrderName
     in_words: str
@@ -34,9 +32,6 @@ class GuidanceStatus(Wire):
     The edge obeys only ``confirmed`` guidance. The compact prompt shows ``proposed`` guidance too, which the LLM alone
     decides by in mode ``llm``.
     """
-
-    # The status of a newer edge may have more fields.
-    model_config = ConfigDict(extra="ignore")
 
     mission_id: MissionId
     status: GuidanceState

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from shared.wire.names import Names
 from shared.wire.schemas import Belief, DecisionId, Features, Init, MissionId, Mode, PromptStyle
@@ -43,9 +43,6 @@ class VisitDeadline(Wire):
 
 class MissionStatus(Wire):
     """``GET /missions/{id}``; ``experiences`` is their number, ``prompt.experiences`` the largest number."""
-
-    # The status of a newer edge may have more fields.
-    model_config = ConfigDict(extra="ignore")
 
     mission_id: MissionId
     scenario: Scenario

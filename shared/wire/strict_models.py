@@ -8,16 +8,18 @@ from shared.kit.received_objects import few_names, plain
 
 
 class Wire(BaseModel):
-    """Strict models: no type coercion, no NaN or infinity, no unknown fields."""
+    """Strict models: no type coercion, no NaN or infinity. An answer may have further fields of a later version."""
 
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+    model_config = ConfigDict(strict=True, allow_inf_nan=False, frozen=True)
 
 
 class Received(Wire):
-    """A request's model: an object with far too many fields gives one error, not one for each field.
+    """A request's model: no unknown fields, and far too many of them give one error, not one for each.
 
     In Python, numpy arrays and numbers are accepted too.
     """
+
+    model_config = ConfigDict(extra="forbid")
 
     # The last one runs first.
     _plain = model_validator(mode="before")(plain)

@@ -47,6 +47,14 @@ def test_every_content_has_an_example_that_its_schema_takes(method: str, path: s
             check(content["schema"], value)
 
 
+def test_answers_may_have_further_fields_and_requests_may_not() -> None:
+    """A client that is made from this document must take the answers of a later edge."""
+    schemas = DOCUMENT["components"]["schemas"]
+    closed = {name for name, schema in schemas.items() if schema.get("additionalProperties") is False}
+    assert closed >= {"DecideRequest", "BatchRequest", "Outcome", "MissionSpec", "ReadingsRequest", "Guidance"}
+    assert not closed & {"DecideResponse", "Tokens", "FeedbackResponse", "MissionStatus", "GuidanceStatus", "Readiness"}
+
+
 def test_what_is_asked_for_a_key_says_so() -> None:
     refusals = {
         f"{method} {path}": sorted({"401", "403", "429"} & DOCUMENT["paths"][path][method]["responses"].keys())
