@@ -181,8 +181,10 @@ class FleetBelief:
             x, y = path.at(reported_m).tolist()
             if math.hypot(x - here[0], y - here[1]) > _POSITION_ERROR_M:
                 here = x, y
-            if taught != step and visit is not None and visit.step == step - 1 and visit.start_m is not None:
-                self.drift.learn(path, visit.start_m, visit.velocity * self._scenario.step_s, reported_m)
+            # Only an outcome says that the UAV got the decision, and flew it.
+            flown = visit if visit is not None and visit.step == step - 1 and visit.failed is not None else None
+            if taught != step and flown is not None and flown.start_m is not None:
+                self.drift.learn(path, flown.start_m, flown.velocity * self._scenario.step_s, reported_m)
         self.uavs[uav] = Whereabouts(step, here, progress, visit=visit, taught=taught)
 
     def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> Measured:

@@ -143,12 +143,16 @@ def test_progress_far_from_the_position_is_not_believed() -> None:
     assert fleet.uavs[0].progress_m == pytest.approx(700.0)
 
 
-def flown(share: float, *, wraps: bool = False, steps: int = 12, again: int = 1) -> FleetBelief:
+def flown(
+    share: float, *, wraps: bool = False, steps: int = 12, again: int = 1, failed: bool | None = False
+) -> FleetBelief:
     """A fleet whose UAV flies this share of each commanded way; ``wraps``: it counts anew in every lap."""
     fleet, progress = FleetBelief(WORLD), 1700.0
     length = fleet.trajectory(0).length_m
     for step in range(steps):
         told = math.fmod(progress, length) if wraps else progress
+        if failed is not None:
+            fleet.settle(0, step - 1, failed)
         fleet.advance(step)
         for _ in range(again):
             fleet.locate(0, step, start(fleet, 0, progress), told)
@@ -166,6 +170,12 @@ def test_still_air_is_no_wind_also_where_a_lap_begins_anew(wraps: bool) -> None:
 def test_a_lap_that_begins_anew_is_no_gust() -> None:
     np.testing.assert_allclose(flown(1.2, wraps=True).drift.wind, flown(1.2).drift.wind, atol=1e-9)
     assert not flown(1.2).drift.none
+    np.testing.assert_array_equal(flown(1.2, failed=True).drift.wind, flown(1.2).drift.wind)
+
+
+def test_a_decision_without_an_outcome_teaches_no_wind() -> None:
+    """The UAV may not have got it, and flown at another velocity: half a way against half a gale look alike."""
+    assert flown(0.5, failed=None).drift.none
 
 
 # ---- what a failure says of the radio
