@@ -16,7 +16,7 @@ from fastapi import FastAPI, Request
 
 
 def forwarder(upstream: str) -> FastAPI:
-    """``POST /decide`` is ``POST chat/completions`` of the upstream."""
+    """An application whose ``POST /decide`` forwards to ``POST chat/completions`` of the upstream."""
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[dict[str, httpx.AsyncClient]]:

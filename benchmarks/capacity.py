@@ -1,14 +1,15 @@
-"""What a decision costs in processor time and commits, and what that predicts of several edges on one PostgreSQL.
+"""The cost of a decision in processor time and commits, and the predicted rate of several edges on one PostgreSQL.
 
     python -m benchmarks.capacity
 
-It starts a PostgreSQL and edges of mode ``value`` on it. One edge at full load shows what a decision costs the edge,
-the database and the client. From these costs it predicts the decisions a second of several edges at full load, where
-every mission is asked of its own edge, and measures these; and it shows the costs at a low pace, beyond what is used
-idle. Edges with the fence of the leases and without it (a patched method) answer in turn, for what a lease adds to a
-decision. Flights of `aicvds simulate` show the edge's processor time for a decision in each mode, before an LLM that
-answers at once. Small transactions show what the disk allows. All of it shares the machine's cores. It prints tables
-and writes JSON.
+It starts a PostgreSQL and edges of mode ``value`` on it. One edge at full load gives the cost of a decision for the
+edge, the database and the client. From these costs the benchmark predicts the rate of several edges at full load, each
+with missions of its own, and it measures this rate. It also measures the costs at a low pace, less the idle costs.
+Edges with the fence of the leases and without it (a patched method) answer in turn, for the cost of a lease in a
+decision.
+Flights of `aicvds simulate` show the edge's processor time for a decision in each mode, with an LLM that answers at
+once. Small transactions show the limit of the disk. All processes share the machine's cores. It prints tables and
+writes JSON.
 """
 
 from __future__ import annotations
@@ -39,14 +40,14 @@ from lab.experiments.intervals import ratio_of_medians
 from service.storage.leases import Leases
 from shared.kit.cores import usable_cores
 
-# Of a decision with the leases' fence to one without.
+# The highest ratio of p50, with the leases' fence to without.
 GOAL_FENCE = 1.1
-# What `python` reads at its start: the same edge without the check of its leases in each transaction.
+# The code of `sitecustomize`, which removes the check of the leases from each transaction.
 _UNFENCED = """
 from service.storage.leases import Leases
 Leases.fence = lambda self, db, missions: None
 """
-# About the journal of one decision, its report and its outcome.
+# The approximate size of a decision in the journal, with its report and outcome.
 _ROW_BYTES = 2000
 _RENEWALS = 10
 # Modes, each with the planner on or off.
@@ -60,17 +61,17 @@ class Capacity(Options):
     edges: tuple[int, ...] = (1, 2)
     """Numbers of edges at full load; the first one's costs predict the others' decisions a second."""
     missions: int = 64
-    """Missions, of three UAVs each, shared out evenly."""
+    """Missions of three UAVs each, distributed evenly over the edges."""
     connections: int = 16
-    """Concurrent connections, shared out evenly."""
+    """Concurrent connections, distributed evenly over the edges."""
     seconds: float = 12.0
-    """Of each measurement."""
+    """Seconds of each measurement."""
     pace: float = 40.0
-    """Decisions a second, for the costs at a low pace and for the fence; 0: leave these out."""
+    """Decisions a second, for the costs at a low pace and for the fence; 0 skips these measurements."""
     rounds: int = 10
-    """Blocks of 150 decisions with the fence, and as many without; 0: leave that out."""
+    """Blocks of 150 decisions with the fence, and as many without; 0 skips this measurement."""
     flights: int = 2
-    """Flights in each mode; 0: leave that out."""
+    """Flights in each mode; 0 skips this measurement."""
     writers: tuple[int, ...] = (1, 4, 16)
     """Connections that commit small transactions at once."""
     leases: int = 3334
@@ -132,18 +133,18 @@ class Site:
         }
 
     def used_since(self, before: Used) -> Used:
-        """What was used between two times."""
+        """The resources used since an earlier :meth:`used`."""
         return {name: now - before[name] for name, now in self.used().items()}
 
 
 def missions(edge: Server, count: int) -> list[Flown]:
     """New missions of one edge."""
     radio = Radio(edge, 0)
-    return [radio.made(f"{edge.port}-{time.monotonic_ns()}-{number}") for number in range(count)]
+    return [radio.create(f"{edge.port}-{time.monotonic_ns()}-{number}") for number in range(count)]
 
 
 def low_pace(site: Site, args: Capacity) -> dict[str, float]:
-    """What one decision costs at a low pace, beyond what the parties use idle."""
+    """The cost of one decision at a low pace, less the idle costs."""
     (edge,) = site.edges
     radios, flown = [Radio(edge, seed) for seed in range(4)], missions(edge, args.missions)
     paced(radios, flown, UAVS * args.missions, 4 * args.pace, True)
@@ -162,7 +163,7 @@ def low_pace(site: Site, args: Capacity) -> dict[str, float]:
 
 
 def full_load(site: Site, args: Capacity) -> dict[str, float]:
-    """Decisions a second where every connection waits for nothing but its answers."""
+    """The rate and costs of decisions when every connection sends its next request at once."""
     share = len(site.edges)
     fleets = [missions(edge, args.missions // share) for edge in site.edges]
     radios = [[Radio(edge, seed) for seed in range(max(1, args.connections // share))] for edge in site.edges]
@@ -175,7 +176,7 @@ def full_load(site: Site, args: Capacity) -> dict[str, float]:
     for seconds in (2.0, args.seconds):
         took.clear()
         before, ends = site.used(), time.perf_counter() + seconds
-        together([partial(fly, index, ends) for index in range(share)])
+        run_threads([partial(fly, index, ends) for index in range(share)])
     used = site.used_since(before)
     lasted = used.pop("seconds")
     return {
@@ -187,9 +188,9 @@ def full_load(site: Site, args: Capacity) -> dict[str, float]:
     }
 
 
-def together(work: Sequence[Callable[[], None]]) -> None:
-    """Do all of the work, each in a thread."""
-    threads = [threading.Thread(target=each) for each in work]
+def run_threads(jobs: Sequence[Callable[[], None]]) -> None:
+    """Run all jobs, each in a thread of its own."""
+    threads = [threading.Thread(target=job) for job in jobs]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -232,7 +233,7 @@ def modes(folder: Path, args: Capacity, which: Sequence[tuple[str, str]] = MODES
             program = [sys.executable, "-m", "shared.kit.command_line"]
             command = [*program, "simulate", "--edge", server.url, "--no-bound", "--await-llm", "on"]
             used, began, decisions = 0.0, 0.0, 0
-            # The first flight loads what is loaded late.
+            # The first flight also loads modules, so it does not count.
             for flight in range(args.flights + 1):
                 if flight == 1:
                     used, began = server.processor_s(), time.perf_counter()
@@ -248,7 +249,7 @@ def modes(folder: Path, args: Capacity, which: Sequence[tuple[str, str]] = MODES
 
 
 def commits(database: Database, writers: Sequence[int], seconds: float) -> dict[str, float]:
-    """Transactions a second of so many connections, each an insert of a decision's size and its commit."""
+    """Transactions a second by number of connections; each inserts a row of a decision's size and commits."""
     with psycopg.connect(database.url, autocommit=True) as db:
         db.execute("CREATE TABLE small (id bigserial PRIMARY KEY, content bytea)")
     content, found = os.urandom(_ROW_BYTES), {}
@@ -262,13 +263,13 @@ def commits(database: Database, writers: Sequence[int], seconds: float) -> dict[
                     db.execute("INSERT INTO small (content) VALUES (%s)", (content,))
                     done[index] += 1
 
-        together([partial(write, index) for index in range(count)])
+        run_threads([partial(write, index) for index in range(count)])
         found[str(count)] = sum(done) / seconds
     return found
 
 
 def renewal(database: Database, count: int) -> dict[str, float]:
-    """What one renewal of so many leases takes: seconds, and the database's processor seconds."""
+    """The cost of renewing ``count`` leases: seconds, and the database's processor seconds."""
     engine = create_engine(database.url.replace("postgresql://", "postgresql+psycopg://", 1))
     leases = Leases(engine)
     for number in range(count):
@@ -309,25 +310,25 @@ def measure(args: Capacity) -> Report:
 
 
 def tables(found: dict[str, Any]) -> dict[str, dict[str, dict[str, Cell]]]:
-    """For the reader."""
+    """The tables of the report."""
     units = {"edge_s": 1e3, "database_s": 1e3, "client_s": 1e3, "commits": 1.0, "log_bytes": 1e-3}
     names = ("edge ms", "database ms", "client ms", "commits", "log kB")
     loads = {"low pace": found["low"]} if "low" in found else {}
-    loads |= {f"{edges} edges, full load": told for edges, told in found["full"].items()}
+    loads |= {f"{edges} edges, full load": costs for edges, costs in found["full"].items()}
     rates = ("predicted_a_s", "decisions_a_s", "cores_used", "p50_ms", "p99_ms")
     renewed = {"seconds": found["renewal"]["seconds"], "database s": found["renewal"]["database_s"]}
     return {
         "A decision costs, mode value": {
-            load: {name: told[key] * unit for name, (key, unit) in zip(names, units.items(), strict=True)}
-            for load, told in loads.items()
+            load: {name: costs[key] * unit for name, (key, unit) in zip(names, units.items(), strict=True)}
+            for load, costs in loads.items()
         },
         f"Full load, {found['cores']} cores for all": {
-            f"{edges} edges": {name: told[name] for name in rates} for edges, told in found["full"].items()
+            f"{edges} edges": {name: costs[name] for name in rates} for edges, costs in found["full"].items()
         },
         "Small transactions, by connections": {n: {"a second": rate} for n, rate in found["commits_a_s"].items()},
         "Renewal": {f"{found['renewal']['leases']} leases": renewed},
         "An edge's processor time": {
-            mode: {"ms a decision": 1e3 * told["edge_s"]} for mode, told in found.get("modes", {}).items()
+            mode: {"ms a decision": 1e3 * costs["edge_s"]} for mode, costs in found.get("modes", {}).items()
         },
     }
 

@@ -60,7 +60,7 @@ def measure(args: Fleet) -> Report:
     paced_rows = {"with outcomes": learning["with_outcomes"], "without": learning["without"]}
     ratio = {name: learning[f"{name}_ratio"] for name in ("p50_ms", "p99_ms")}
     tables = {
-        f"Missions, {args.connections} connections": {f"{int(n):,}": told for n, told in found["rates"].items()},
+        f"Missions, {args.connections} connections": {f"{int(n):,}": rate for n, rate in found["rates"].items()},
         f"{args.pace:g} decisions a second": {**paced_rows, "ratio": ratio},
         "Memory of a mission": {
             f"of {args.each} decisions": {"kB": memory["kb_a_mission"]},
@@ -72,12 +72,12 @@ def measure(args: Fleet) -> Report:
 
 def _figures(args: Fleet, edge: Server) -> dict[str, Any]:
     radios = [Radio(edge, seed) for seed in range(args.connections)]
-    warm = radios[0].made("warm-up")
+    warm = radios[0].create("warm-up")
     at_once(radios[:1], [lambda radio: radio.decide(warm, True)] * 60)
     rates, missions = dict[str, dict[str, float]](), list[Flown]()
     empty = edge.resident_bytes()
     for number in track(args.missions, "flying"):
-        missions += [radios[0].made(f"fleet-{n}") for n in range(len(missions), number)]
+        missions += [radios[0].create(f"fleet-{n}") for n in range(len(missions), number)]
         rates[str(number)] = _rates(radios, missions, max(args.decisions, UAVS * number))
     learning = _learning(args, radios, missions[: args.missions[-2] if len(args.missions) > 1 else 1])
     memory = {"missions": float(len(missions)), "decisions_each": float(args.each)}
@@ -102,15 +102,15 @@ def _learning(args: Fleet, radios: Sequence[Radio], missions: Sequence[Flown]) -
         return lambda _: paced(radios, missions, args.block, args.pace, learn)
 
     took = in_turn({"with_outcomes": block(True), "without": block(False)}, args.rounds)
-    told = {name: _percentiles(functools.reduce(operator.iadd, blocks, [])) for name, blocks in took.items()}
-    ratios = {f"{p}_ratio": round(told["with_outcomes"][p] / told["without"][p], 2) for p in ("p50_ms", "p99_ms")}
-    return {"pace": args.pace, "missions": len(missions), **told, **ratios}
+    times = {name: _percentiles(functools.reduce(operator.iadd, blocks, [])) for name, blocks in took.items()}
+    ratios = {f"{p}_ratio": round(times["with_outcomes"][p] / times["without"][p], 2) for p in ("p50_ms", "p99_ms")}
+    return {"pace": args.pace, "missions": len(missions), **times, **ratios}
 
 
 def _fill(radios: Sequence[Radio], missions: Sequence[Flown], decisions: int) -> None:
     def fill(mission: Flown) -> Callable[[Radio], None]:
         def step(radio: Radio) -> None:
-            while mission.told < decisions:
+            while mission.decisions < decisions:
                 if mission.uav:
                     radio.decide(mission, True)
                 else:

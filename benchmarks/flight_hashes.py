@@ -49,7 +49,7 @@ DEADLINE_MS = 60_000
 # An answer waits for the store, and so for learning from its request's outcome. Without a store the next request may
 # overtake learning on a busy machine.
 SETTINGS = {"MODE": "value", "PLANNER_MS": "60000"}
-# Reasons of decisions that a clock caused.
+# The reasons of decisions that depend on a clock.
 LATE = {"critic_timeout", "llm_timeout", "llm_busy", "edge_refused", "edge_protocol"}
 
 
@@ -64,7 +64,7 @@ class Hashes:
     only: str = ""
     """A regular expression: fly only the flights whose names match, such as `^paper (value|eof)`."""
     out: Path = Path("runs/flight_hashes.json")
-    """Where to write."""
+    """File to write."""
     against: Path | None = None
     """An earlier result: compare the flights that are in both; the exit code is 1 if one differs."""
 
@@ -89,7 +89,7 @@ def courses() -> list[Course]:
 
 
 def main(options: Hashes) -> int:
-    """The exit code."""
+    """Fly, compare and write; returns the exit code."""
     chosen = [course for course in courses() if re.search(options.only, str(course))]
     before = json.loads(options.against.read_text())["flights"] if options.against else {}
     flights: dict[str, dict[str, Any]] = {}
@@ -101,7 +101,7 @@ def main(options: Hashes) -> int:
                 began = time.monotonic()
                 flight = flown(course, seed, options.steps, server.url)
                 name = f"{course}, {flight.steps_flown} steps, seed {seed}"
-                flights[name] = told(flight, name)
+                flights[name] = summary_of(flight, name)
                 took = time.monotonic() - began
                 same = flights[name] == before.get(name, flights[name])
                 if not same:
@@ -115,8 +115,8 @@ def main(options: Hashes) -> int:
     return 1 if differ or (options.against and not compared) else 0
 
 
-def told(flight: Flight, name: str) -> dict[str, Any]:
-    """A flight's hash, and sums that help to find a difference; raises an error if a clock decided."""
+def summary_of(flight: Flight, name: str) -> dict[str, Any]:
+    """A flight's hash, and sums that help to find a difference; raises ``RuntimeError`` if a clock decided."""
     lines = [json.loads(decision.model_dump_json()) for decision in flight.decisions]
     if late := {line["reason"] for line in lines} & LATE:
         raise RuntimeError(f"{name}: decided by a clock, so nothing is proven: {', '.join(sorted(late))}")

@@ -1,6 +1,6 @@
-"""The prompts of a mission, decision by decision, in several forms side by side.
+"""The prompts of each decision of a mission, in several forms.
 
-A policy on board flies the mission. For each form of the prompt there is one of the edge's missions: it gets the UAVs'
+A policy on board flies the mission. Each form of the prompt has a mission object of the edge, which gets the UAVs'
 reports, the decisions and their costs, and makes its prompts. So all prompts of one decision are about the same
 situation, and no LLM is needed.
 """
@@ -29,7 +29,7 @@ from simulator.sites.site import Site
 from simulator.world.observation import Observation, decide_request
 
 GUIDED, LLM, PAPER = "guided", "llm", "paper"
-WAYS = {
+FORMS = {
     GUIDED: "mode guided (default)",
     LLM: "mode llm: the paper's template",
     PAPER: "the same without attention",
@@ -40,8 +40,8 @@ CONTEXT = 8192
 
 
 @dataclass(frozen=True)
-class Put:
-    """One decision's prompt in one form; mode ``guided``, whose answer is a letter, has an ``offer``."""
+class DecisionPrompt:
+    """The prompt of one decision in one form; ``offer`` has the lettered candidates of mode ``guided``."""
 
     prompt: Prompt
     sensors: list[int]
@@ -56,19 +56,19 @@ class Put:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """One decision: its prompts by form, and the situation for the rollout evaluator to judge answers."""
+class FlownDecision:
+    """One decision: its prompts by form, and the situation in which the rollout evaluator judges answers."""
 
     seed: int
     step: int
     uav: int
-    ways: dict[str, Put]
+    prompts: dict[str, DecisionPrompt]
     situation: RolloutState
 
 
 @dataclass(frozen=True)
-class Together:
-    """One step of the fleet as mode ``guided``'s query about all UAVs."""
+class FleetPrompt:
+    """Mode ``guided``'s query about all UAVs of one step."""
 
     step: int
     prompt: Prompt
@@ -79,55 +79,57 @@ class Together:
         return label_body(None, self.prompt.static, self.prompt.user, "grammar", self.lists)
 
 
-class Scribe(LocalPilot):
+class RecordingPilot(LocalPilot):
     """Flies by a planner on board and records the prompts of each decision.
 
-    ``asked`` has the decisions for which every form has a prompt, ``together`` the fleet's whole steps.
+    ``decisions`` are those for which every form has a prompt. ``fleet_prompts`` are those of the steps in which every
+    UAV has one.
     """
 
     def __init__(self, scenario: Scenario, seed: int, policy: str = _POLICY) -> None:
         super().__init__(policy, scenario, seed)
         self._seed = seed
         self._missions = missions(scenario, seed)
-        self._owed: dict[int, Outcome] = {}
+        self._outcomes: dict[int, Outcome] = {}
         self._decided: dict[int, str] = {}
         self._step: dict[int, tuple[CandidateSet, AttendedState]] = {}
-        self.asked: list[Asked] = []
-        self.together: list[Together] = []
+        self.decisions: list[FlownDecision] = []
+        self.fleet_prompts: list[FleetPrompt] = []
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
         """The policy's choice."""
         choice = super().decide(uav, observation, taken)
         step = int(observation["step"][0])
         self._decided[uav] = name = uuid.uuid4().hex
-        request = decide_request(uav, observation, "flown", outcome=self._owed.pop(uav, None))
-        ways: dict[str, Put] = {}
+        request = decide_request(uav, observation, "flown", outcome=self._outcomes.pop(uav, None))
+        prompts: dict[str, DecisionPrompt] = {}
         situation: RolloutState | None = None
-        for way, mission in self._missions.items():
+        for form, mission in self._missions.items():
             if request.outcome is not None:
                 mission.apply(request.outcome)
             attempt = mission.observe(request, step)
             view = AttendedState.of(mission, request, step)
             if view.rows:
-                ways[way] = self._put(mission, view)
-            if way == GUIDED:
+                prompts[form] = self._prompt_of(mission, view)
+            if form == GUIDED:
                 reserved = mission.reservations.of_others(step, uav)
                 situation = RolloutState.of(mission.belief, mission.scenario, step, uav, reserved=reserved)
             mission.commit(view.pending(name, Action(choice.sensor, choice.velocity)), attempt)
-        if situation is not None and len(ways) == len(self._missions):
-            self.asked.append(Asked(self._seed, step, uav, ways, situation))
+        if situation is not None and len(prompts) == len(self._missions):
+            self.decisions.append(FlownDecision(self._seed, step, uav, prompts, situation))
         return choice
 
-    def _put(self, mission: Mission, view: AttendedState) -> Put:
+    def _prompt_of(self, mission: Mission, view: AttendedState) -> DecisionPrompt:
         shown = view.shown()
         if not isinstance(mission.template, GuidedTemplate):
-            return Put(mission.template.prompt(view.state, shown, mission.experiences.block), view.kept_ids)
+            return DecisionPrompt(mission.template.prompt(view.state, shown, mission.experiences.block), view.kept_ids)
         offer = candidates_of(view, template_of(mission))
-        self._note(mission, mission.template, view, offer)
-        return Put(mission.template.choice_prompt(offer, view.state, mission.experiences.block), view.kept_ids, offer)
+        self._record(mission, mission.template, view, offer)
+        prompt = mission.template.choice_prompt(offer, view.state, mission.experiences.block)
+        return DecisionPrompt(prompt, view.kept_ids, offer)
 
-    def _note(self, mission: Mission, template: GuidedTemplate, view: AttendedState, offer: CandidateSet) -> None:
-        self._step = {uav: had for uav, had in self._step.items() if had[1].step == view.step}
+    def _record(self, mission: Mission, template: GuidedTemplate, view: AttendedState, offer: CandidateSet) -> None:
+        self._step = {uav: prompted for uav, prompted in self._step.items() if prompted[1].step == view.step}
         self._step[view.uav_id] = offer, view
         if len(self._step) == mission.scenario.uavs:
             shares = template.fleet_prompts(
@@ -136,29 +138,30 @@ class Scribe(LocalPilot):
             first = next(iter(shares.values()))
             state = "".join(share.state for share in shares.values())
             whole = Prompt(template.fleet_static, first.experiences, state, first.uncompressed)
-            self.together.append(Together(view.step, whole, [list(o.labels) for o, _ in self._step.values()]))
+            lists = [list(o.labels) for o, _ in self._step.values()]
+            self.fleet_prompts.append(FleetPrompt(view.step, whole, lists))
 
     def learn(self, uav: int, choice: PilotChoice, cost: float, failed: bool) -> None:
         """Keep the outcome for this UAV's next request."""
-        self._owed[uav] = Outcome(decision_id=self._decided[uav], cost=cost, failed=failed)
+        self._outcomes[uav] = Outcome(decision_id=self._decided[uav], cost=cost, failed=failed)
 
 
 def missions(scenario: Scenario, seed: int) -> dict[str, Mission]:
-    """The edge's mission for each of ``WAYS``, with the default settings."""
+    """The edge's mission for each of ``FORMS``, with the default settings."""
     settings = Settings(llm_context=CONTEXT, llm_adapter="off")
 
-    def made(name: str, **spec: Any) -> Mission:
+    def create(name: str, **spec: Any) -> Mission:
         return Mission(name, MissionSpec(scenario=scenario, seed=seed, planner="off", **spec), settings)
 
     return {
-        GUIDED: made(GUIDED, mode="guided"),
-        LLM: made(LLM, mode="llm"),
-        PAPER: made(PAPER, mode="llm", attention="off"),
+        GUIDED: create(GUIDED, mode="guided"),
+        LLM: create(LLM, mode="llm"),
+        PAPER: create(PAPER, mode="llm", attention="off"),
     }
 
 
-def flown(scenario: Scenario, seed: int, policy: str = _POLICY) -> Scribe:
+def flown(scenario: Scenario, seed: int, policy: str = _POLICY) -> RecordingPilot:
     """Fly and record one mission."""
-    scribe = Scribe(scenario, seed, policy)
-    fly(Site(scenario), scribe, seed)
-    return scribe
+    pilot = RecordingPilot(scenario, seed, policy)
+    fly(Site(scenario), pilot, seed)
+    return pilot

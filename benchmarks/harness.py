@@ -33,7 +33,7 @@ from simulator.flying.local_edge import HOST, usable_port
 
 ROOT = Path(__file__).parents[1]
 START_S, STOP_S = 300.0, 30.0
-# Of the caller's settings an edge inherits only those of the machine's paths.
+# The only settings that an edge inherits from the caller: those of the machine's paths.
 _INHERITED = "AICVDS_CACHE_DIR"
 
 # A text, a number, or a ratio with the bounds of its interval.
@@ -83,7 +83,7 @@ class Server:
 
     @property
     def port(self) -> int:
-        """Its port on the loopback."""
+        """The port on the loopback interface."""
         return int(self.url.rsplit(":", 1)[1])
 
     def processor_s(self) -> float:
@@ -95,7 +95,7 @@ class Server:
         return sum(each.memory_info().rss for each in (self.process, *self.process.children()))
 
     def resident_parts(self) -> dict[str, int]:
-        """The same by part: what the process and its store's writer allocate, and pages of files and shared memory."""
+        """Resident bytes by part: allocations of the process and of its store's writer, and file and shared pages."""
         parts = dict.fromkeys(("edge", "writer", "files"), 0)
         for at, each in enumerate((self.process, *self.process.children())):
             status = Path(f"/proc/{each.pid}/status").read_text(encoding="ascii")
@@ -104,12 +104,12 @@ class Server:
         return parts
 
 
-Asked = TypeVar("Asked", bound=Options)
+OptionsT = TypeVar("OptionsT", bound=Options)
 K = TypeVar("K")
 T = TypeVar("T")
 
 
-def run(options: type[Asked], measure: Callable[[Asked], Report]) -> bool:
+def run(options: type[OptionsT], measure: Callable[[OptionsT], Report]) -> bool:
     """Parse the command line, measure, print tables and goals, write the figures; returns whether goals are met."""
     args = tyro.cli(options, description=inspect.getmodule(measure).__doc__)
     report = measure(args)
@@ -200,7 +200,7 @@ def running(
     """Within the context, run a server as a process.
 
     Args:
-        health: path that answers 200, with what is ``ready``, once the server can be measured.
+        health: path that answers 200, with the content ``ready``, once the server can be measured.
         env: its environment; None: this process's.
         folder: where it runs.
 

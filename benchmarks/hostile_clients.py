@@ -19,12 +19,12 @@ TAKEN_S = 35
 FILE, FILES = "vendor/uPlot.esm.js", 17
 PIPELINED = f"GET /static/{FILE} HTTP/1.1\r\nhost: x\r\n\r\n".encode() * FILES
 POST = b"POST /decide HTTP/1.1\r\nhost: x\r\ncontent-type: application/json\r\ncontent-length: 1000\r\n\r\n"
-# Closing with it resets the connection at once.
+# The SO_LINGER value with which a close resets the connection at once.
 ABORT = struct.pack("ii", 1, 0)
 
 
 class Client:
-    """One hostile client after the other, each with a connection of its own, which the edge ends at last."""
+    """Hostile clients, one after the other; each has a connection of its own, which the edge ends."""
 
     def __init__(self, address: tuple[str, int], kind: str, ended: Counter[str]) -> None:
         self._address, self._kind, self._ended = address, kind, ended
@@ -54,7 +54,7 @@ class Client:
         await self._cut_off(loop, connection)
 
     async def _cut_off(self, loop: asyncio.AbstractEventLoop, connection: socket.socket) -> None:
-        """Check that the edge has ended the connection: what is left of its answers is no longer sent."""
+        """Check that the edge has ended the connection, and no longer sends the rest of its answers."""
         left = 0
         while received := await loop.sock_recv(connection, 65536):
             left += len(received)
@@ -88,17 +88,17 @@ KINDS = ("never_reading", "reading_slowly", "headers_slowly", "body_slowly", "va
 
 
 @contextmanager
-def hostile(url: str, of_a_kind: int) -> Iterator[Counter[str]]:
-    """So many of each kind at a time, from another thread; yields how many connections of each kind have ended."""
+def hostile(url: str, count: int) -> Iterator[Counter[str]]:
+    """Run ``count`` clients of each kind in another thread; yields the numbers of ended connections by kind."""
     parts = urlsplit(url)
     ended: Counter[str] = Counter()
-    over = threading.Event()
+    stopped = threading.Event()
 
     async def run() -> None:
         address = (parts.hostname or "", parts.port or 0)
-        clients = [Client(address, kind, ended).run() for kind in KINDS for _ in range(of_a_kind)]
+        clients = [Client(address, kind, ended).run() for kind in KINDS for _ in range(count)]
         running = [asyncio.create_task(client) for client in clients]
-        while not over.is_set():
+        while not stopped.is_set():
             await asyncio.sleep(0.1)
             for client in running:
                 if client.done():
@@ -120,6 +120,6 @@ def hostile(url: str, of_a_kind: int) -> Iterator[Counter[str]]:
     try:
         yield ended
     finally:
-        over.set()
+        stopped.set()
         clients.join()
     assert failed == []

@@ -1,4 +1,4 @@
-"""An LLM server that answers at once, so that a benchmark measures only the cost of asking.
+"""An LLM server that answers at once, so that a benchmark measures only the cost of a request.
 
     python -m benchmarks.instant_llm 9009
 
@@ -51,8 +51,8 @@ async def _body(receive: Receive) -> bytes:
             return body
 
 
-def _completion(asked: bytes) -> dict[str, object]:
-    text = " ".join(_FIRST.findall(json.loads(asked).get("grammar", ""))) or "0 0"
+def _completion(request: bytes) -> dict[str, object]:
+    text = " ".join(_FIRST.findall(json.loads(request).get("grammar", ""))) or "0 0"
     choice = {"index": 0, "message": {"role": "assistant", "content": text}, "finish_reason": "stop"}
     head = {"id": "0", "object": "chat.completion", "created": 0, "model": "instant"}
     return {**head, "choices": [choice], "usage": _USAGE}

@@ -26,9 +26,9 @@ from typing import Any, Literal
 
 import torch
 
-from benchmarks.flown_prompts import GUIDED, LLM, Asked, Scribe, Together, flown
+from benchmarks.flown_prompts import GUIDED, LLM, FleetPrompt, FlownDecision, RecordingPilot, flown
 from benchmarks.harness import Cell, Options, Report, in_turn, run
-from lab.benchmarks.local_llm import Answered, LocalLLM
+from lab.benchmarks.local_llm import LocalLLM, TimedAnswer
 from lab.experiments.intervals import ratio_of_medians
 from service.config.settings import Settings
 from shared.kit.cores import usable_cores
@@ -58,84 +58,84 @@ class Llm(Options):
 
 
 @dataclass
-class Line:
-    """One server, and the mission's decisions for it, each once, in their order."""
+class DecisionQueue:
+    """One server and its queue of the mission's decisions, in their order."""
 
-    way: str
+    form: str
     llm: LocalLLM
-    decisions: Iterator[Asked]
+    decisions: Iterator[FlownDecision]
     levels: int
     limit_s: float
     body: dict[str, Any] = field(default_factory=dict)
 
-    def ask(self) -> Answered:
-        """The next decision, as the edge would ask."""
-        self.body = next(self.decisions).ways[self.way].body(self.levels)
+    def ask(self) -> TimedAnswer:
+        """Request the next decision, as the edge would."""
+        self.body = next(self.decisions).prompts[self.form].body(self.levels)
         return self.llm.ask(self.body, self.limit_s)
 
-    def ask_cold(self) -> Answered:
-        """Ask for the last decision again; the server reads the whole prompt."""
+    def ask_cold(self) -> TimedAnswer:
+        """Request the last decision again; the server reads the whole prompt."""
         return self.llm.ask(self.body, self.limit_s, cache_prompt=False)
 
 
-Times = dict[str, list[Answered]]
+Times = dict[str, list[TimedAnswer]]
 
 
 def measure(args: Llm) -> Report:
-    """Fly, then ask for one UAV and for the fleet."""
+    """Fly, then request decisions for one UAV and for the fleet."""
     torch.set_num_threads(1)
     scenario = scenario_named("paper")
     if args.steps is not None:
         scenario = scenario.model_copy(update={"steps": args.steps})
-    scribe = flown(scenario, args.seed, args.policy)
-    alone, fleet = decisions(scribe, scenario, args), fleets(scribe, scenario, args)
-    found = {"cores": usable_cores(), "rounds": args.rounds, "limit_s": args.limit_s, **alone, "fleet": fleet}
+    pilot = flown(scenario, args.seed, args.policy)
+    single, fleet = decisions(pilot, scenario, args), fleets(pilot, scenario, args)
+    found = {"cores": usable_cores(), "rounds": args.rounds, "limit_s": args.limit_s, **single, "fleet": fleet}
     tables: dict[str, dict[str, dict[str, Cell]]] = {
-        "Time to a decision": alone["times"],
-        "Ratios [95% interval]": {name: {"ratio": ratio} for name, ratio in alone["ratios"].items()},
+        "Time to a decision": single["times"],
+        "Ratios [95% interval]": {name: {"ratio": ratio} for name, ratio in single["ratios"].items()},
         "A fleet's step, mode guided": fleet,
     }
     return Report(found, tables)
 
 
-def decisions(scribe: Scribe, scenario: Scenario, args: Llm) -> dict[str, Any]:
-    """One UAV's decisions in every condition: ``<way> <cold|cached> <threads> <quiet|busy>``."""
+def decisions(pilot: RecordingPilot, scenario: Scenario, args: Llm) -> dict[str, Any]:
+    """One UAV's decisions in every condition: ``<form> <cold|cached> <threads> <quiet|busy>``."""
     # From this decision on the block of experiences is full.
-    asked = scribe.asked[len(scribe.asked) // 3 :]
-    if len(asked) < 2 * args.rounds + 1:
-        raise SystemExit(f"--rounds: the mission has decisions for {(len(asked) - 1) // 2} at most")
+    flown_decisions = pilot.decisions[len(pilot.decisions) // 3 :]
+    if len(flown_decisions) < 2 * args.rounds + 1:
+        raise SystemExit(f"--rounds: the mission has decisions for {(len(flown_decisions) - 1) // 2} at most")
     context, levels = Settings().llm_context, scenario.max_velocity + 1
     first: Times = {}
-    variants: dict[str, Callable[[int], Answered]] = {}
+    variants: dict[str, Callable[[int], TimedAnswer]] = {}
     with ExitStack() as stack:
-        lines = {
-            (way, threads): Line(
-                way, stack.enter_context(LocalLLM(threads, context)), iter(asked), levels, args.limit_s
+        queues = {
+            (form, threads): DecisionQueue(
+                form, stack.enter_context(LocalLLM(threads, context)), iter(flown_decisions), levels, args.limit_s
             )
             for threads in args.threads
-            for way in (GUIDED, LLM)
+            for form in (GUIDED, LLM)
         }
-        for line in lines.values():
-            # The first request to a server with an empty cache.
-            first.setdefault(f"{line.way} first", []).append(line.ask())
+        for queue in queues.values():
+            # The cache of the server is empty.
+            first.setdefault(f"{queue.form} first", []).append(queue.ask())
         for load in (QUIET, BUSY):
-            for (way, threads), line in lines.items():
-                variants[f"{way} cached {threads} {load}"] = asking(line.ask, load)
+            for (form, threads), queue in queues.items():
+                variants[f"{form} cached {threads} {load}"] = with_load(queue.ask, load)
                 if load == QUIET:
-                    variants[f"{way} cold {threads} {load}"] = asking(line.ask_cold, load)
+                    variants[f"{form} cold {threads} {load}"] = with_load(queue.ask_cold, load)
         times = first | in_turn(variants, args.rounds)
-        load_s = statistics.median(line.llm.load_s for line in lines.values())
+        load_s = statistics.median(queue.llm.load_s for queue in queues.values())
     return {"load_s_median": load_s, "times": summed(times), "ratios": ratios(times, args.threads)}
 
 
-def asking(ask: Callable[[], Answered], load: str) -> Callable[[int], Answered]:
-    """A request in a round, with such neighbours."""
+def with_load(ask: Callable[[], TimedAnswer], load: str) -> Callable[[int], TimedAnswer]:
+    """The request as a variant for :func:`in_turn`, sent while the neighbours run."""
 
-    def asked(_: int) -> Answered:
+    def request(_: int) -> TimedAnswer:
         with neighbours(load):
             return ask()
 
-    return asked
+    return request
 
 
 @contextmanager
@@ -154,31 +154,31 @@ def neighbours(load: str) -> Iterator[None]:
 
 
 def summed(times: Times) -> dict[str, dict[str, float]]:
-    """Medians, and the newly read tokens."""
+    """Median times, and means of the newly read and written tokens."""
     return {
         name: {
-            "seconds_median": statistics.median(one.seconds for one in told),
-            "first_token_s_median": statistics.median(one.first_s for one in told),
-            "cpu_s_median": statistics.median(one.cpu_s for one in told),
-            "new_mean": statistics.fmean(one.new for one in told),
-            "written_mean": statistics.fmean(one.written for one in told),
-            "late": sum(one.late for one in told),
+            "seconds_median": statistics.median(one.seconds for one in answers),
+            "first_token_s_median": statistics.median(one.first_s for one in answers),
+            "cpu_s_median": statistics.median(one.cpu_s for one in answers),
+            "new_mean": statistics.fmean(one.new for one in answers),
+            "written_mean": statistics.fmean(one.written for one in answers),
+            "late": sum(one.late for one in answers),
         }
-        for name, told in times.items()
+        for name, answers in times.items()
     }
 
 
 def ratios(times: Times, threads: Sequence[int]) -> dict[str, list[float]]:
-    """Ratios of the conditions measured side by side."""
+    """Ratios of medians between conditions of the same rounds."""
 
     def of(ours: str, theirs: str) -> list[float]:
         return ratio_of_medians([one.seconds for one in times[ours]], [one.seconds for one in times[theirs]])
 
     found = {}
     for n in threads:
-        for way in (GUIDED, LLM):
-            found[f"{way}, {n} threads: cached / cold"] = of(f"{way} cached {n} quiet", f"{way} cold {n} quiet")
-            found[f"{way}, {n} threads: busy / quiet"] = of(f"{way} cached {n} busy", f"{way} cached {n} quiet")
+        for form in (GUIDED, LLM):
+            found[f"{form}, {n} threads: cached / cold"] = of(f"{form} cached {n} quiet", f"{form} cold {n} quiet")
+            found[f"{form}, {n} threads: busy / quiet"] = of(f"{form} cached {n} busy", f"{form} cached {n} quiet")
         found[f"{n} threads: scoring / generating"] = of(f"{GUIDED} cached {n} quiet", f"{LLM} cached {n} quiet")
         generated = times[f"{LLM} cached {n} quiet"]
         found[f"{n} threads: first token / all, generating"] = ratio_of_medians(
@@ -193,37 +193,37 @@ def ratios(times: Times, threads: Sequence[int]) -> dict[str, list[float]]:
     return found
 
 
-def fleets(scribe: Scribe, scenario: Scenario, args: Llm) -> dict[str, Any]:
-    """The decisions of all UAVs of a step, in mode ``guided``, by the default number of threads: seconds to the last.
+def fleets(pilot: RecordingPilot, scenario: Scenario, args: Llm) -> dict[str, Any]:
+    """The time to the last decision of a step, in mode ``guided`` with the default number of threads.
 
-    Each way has a server of its own, so that each has the step before in its cache.
+    Each way to request the decisions has a server of its own, with the previous step in its cache.
     """
-    steps = whole_steps(scribe, scenario)[-args.rounds - 1 :]
+    steps = whole_steps(pilot, scenario)[-args.rounds - 1 :]
     threads, uavs, context = Settings().embedded_threads, scenario.uavs, Settings().llm_context
     with ExitStack() as stack, ThreadPoolExecutor(uavs) as pool:
 
         def step(name: str) -> Callable[[int], tuple[float, float, int]]:
             llm = stack.enter_context(LocalLLM(threads, context, slots=uavs if name == SLOTS else 1))
 
-            def asked(number: int) -> tuple[float, float, int]:
+            def request(number: int) -> tuple[float, float, int]:
                 began, cpu_began = time.perf_counter(), time.process_time()
                 answers = ask_fleet(name, llm, *steps[number + 1], args.limit_s, pool)
                 took, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
                 return took, cpu_s, sum(one.new for one in answers)
 
-            return asked
+            return request
 
         # The first step has an empty cache.
         found = in_turn({name: step(name) for name in (ROW, CALL, QUEUE, SLOTS)}, len(steps) - 1, warm_up=1)
-    seconds = {name: [took for took, _, _ in told] for name, told in found.items()}
+    seconds = {name: [took for took, _, _ in measured] for name, measured in found.items()}
     return {
         name: {
             "seconds_median": statistics.median(seconds[name]),
-            "cpu_s_median": statistics.median(cpu_s for _, cpu_s, _ in told),
-            "new_mean": statistics.fmean(new for _, _, new in told),
+            "cpu_s_median": statistics.median(cpu_s for _, cpu_s, _ in measured),
+            "new_mean": statistics.fmean(new for _, _, new in measured),
             "to_one_after_the_other": ratio_of_medians(seconds[name], seconds[ROW]),
         }
-        for name, told in found.items()
+        for name, measured in found.items()
     }
 
 
@@ -231,13 +231,13 @@ def ask_fleet(
     name: str,
     llm: LocalLLM,
     bodies: Sequence[dict[str, Any]],
-    together: Together,
+    fleet_prompt: FleetPrompt,
     limit_s: float,
     pool: ThreadPoolExecutor,
-) -> list[Answered]:
-    """Ask for one step's decisions in one of the four ways."""
+) -> list[TimedAnswer]:
+    """Request one step's decisions in one of the four ways."""
     if name == CALL:
-        return [llm.ask(together.body(), limit_s)]
+        return [llm.ask(fleet_prompt.body(), limit_s)]
     if name == ROW:
         return [llm.ask(body, limit_s) for body in bodies]
     slots = range(len(bodies)) if name == SLOTS else [0] * len(bodies)
@@ -245,14 +245,14 @@ def ask_fleet(
     return [one.result() for one in waiting]
 
 
-def whole_steps(scribe: Scribe, scenario: Scenario) -> list[tuple[list[dict[str, Any]], Together]]:
-    """The steps in which every UAV asks: each one's request, and the one about all."""
+def whole_steps(pilot: RecordingPilot, scenario: Scenario) -> list[tuple[list[dict[str, Any]], FleetPrompt]]:
+    """The steps with a request for every UAV: these requests, and the one about all UAVs."""
     levels = scenario.max_velocity + 1
     found = []
-    for together in scribe.together:
-        bodies = [asked.ways[GUIDED].body(levels) for asked in scribe.asked if asked.step == together.step]
+    for fleet_prompt in pilot.fleet_prompts:
+        bodies = [one.prompts[GUIDED].body(levels) for one in pilot.decisions if one.step == fleet_prompt.step]
         if len(bodies) == scenario.uavs:
-            found.append((bodies, together))
+            found.append((bodies, fleet_prompt))
     return found
 
 

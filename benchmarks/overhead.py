@@ -1,19 +1,19 @@
-"""The latency that the edge adds to an LLM that answers at once, beside a bare forwarder and LiteLLM's proxy.
+"""The latency that the edge adds to an LLM that answers at once, compared with a bare forwarder and LiteLLM's proxy.
 
     python -m benchmarks.overhead
 
-Before an LLM server that answers at once (``instant_llm.py``) there are, each a process of its own on loopback:
-(a) ``bare``, a FastAPI application that only passes the same JSON on with httpx; (b) ``litellm``, LiteLLM's proxy with
+These services, each a process of its own on loopback, query an LLM server that answers at once (``instant_llm.py``):
+(a) ``bare``, a FastAPI application that only forwards the same JSON with httpx; (b) ``litellm``, LiteLLM's proxy with
 the same prompt as a chat completion, behind its one key; (c) ``edge``, ``POST /decide`` in mode ``llm`` with everything
 on: keys, attention, prompt, token counting, checks, SQLite store, metrics, and outcomes that it learns from;
 (d) ``edge, no outcomes``: the same without outcomes; (e) ``edge, no store``: as (c), but in memory only. 3 and 64 UAVs
-send their next request after each answer. Every round measures all of (a) to (e), so that a noisy machine is noisy for
-all. Added latency is the latency at the UAV less that of the LLM server with the same load generator. It prints
-medians over rounds and their ratios with 95% bootstrap intervals over rounds, and writes the same as JSON. Goals: the
-edge adds at most 1.5 times as much as ``bare`` and 0.4 times as much as LiteLLM, and answers at least 0.6 and 3 times
-as many requests a second. The processor time a request is that of the service's processes, the store's writer among
-them. ``--before`` names another checkout of this repository, for example of the last commit, with its virtual
-environment in ``.venv``: its edge, as (c), is measured in the same rounds.
+send their next request after each answer. Every round measures all of (a) to (e), so that other work on the
+machine slows all. Added latency is the latency at the UAV less that of the LLM server with the same load generator.
+It prints medians over rounds and their ratios with 95% bootstrap intervals over rounds, and writes the same as JSON.
+Goals: the edge adds at most 1.5 times as much as ``bare`` and 0.4 times as much as LiteLLM, and answers at least 0.6
+and 3 times as many requests a second. The processor time a request is that of the service's processes, including the
+store's writer. ``--before`` names another checkout of this repository, for example of the last commit, with its
+virtual environment in ``.venv``; the rounds then also measure its edge, as (c).
 The first run installs LiteLLM into a virtual environment of its own under runs/; --litellm none omits it.
 """
 
@@ -41,7 +41,7 @@ from simulator.flying.local_edge import HOST, usable_port
 
 LITELLM = "litellm[proxy]==1.106.2"
 QUANTITIES = {"p50": "p50 ms", "p99": "p99 ms", "rps": "requests/s", "cpu": "processor ms"}
-# Latencies are compared by what they add to the LLM server's own.
+# Latencies are compared after subtracting the LLM server's own.
 RATIOS = {"p50": "added p50", "p99": "added p99", "rps": "requests/s", "cpu": "processor time"}
 # The services that the edge is compared to, with the highest ratio of latencies and the lowest of requests a second.
 GOALS = {"bare": (1.5, 0.6), "litellm": (0.4, 3.0), "before": None}
@@ -60,7 +60,7 @@ class Overhead(Options):
     litellm: str = "install"
     """`install`, the path of a `litellm` program, or `none`."""
     before: Path | None = None
-    """Another checkout, whose edge is measured beside this one's."""
+    """Another checkout, whose edge is measured too."""
 
 
 def litellm_program(choice: str) -> str | None:
@@ -85,25 +85,25 @@ def start(folder: Path, options: Overhead, stack: ExitStack) -> list[Target]:
     forwarder = [sys.executable, "-m", "benchmarks.bare_forwarder", str(port), upstream]
     forwards = stack.enter_context(running(forwarder, f"http://{HOST}:{port}", "/healthz"))
     key, settings = made_key(keys), {**EDGE, "LLM_URL": upstream, "KEYS": keys}
-    this = stack.enter_context(edge(settings))
-    # An edge each: missions of another target would make its store and its processor's caches those of twice the load.
+    default = stack.enter_context(edge(settings))
+    # Each target has an edge of its own: shared missions would double the load on the store and the caches.
     no_outcomes = stack.enter_context(edge(settings))
     storeless = stack.enter_context(edge({**settings, "STORE": "none"}))
     targets = [
         Target("bare", forwards, lambda uav: uav.report(outcomes=False)),
-        Target("edge", this, lambda uav: uav.report(outcomes=True), key),
+        Target("edge", default, lambda uav: uav.report(outcomes=True), key),
         Target("edge, no outcomes", no_outcomes, lambda uav: uav.report(outcomes=False), key),
         Target("edge, no store", storeless, lambda uav: uav.report(outcomes=True), key),
     ]
     if options.before is not None:
         other = stack.enter_context(edge(settings, options.before))
         targets.insert(2, Target("before", other, lambda uav: uav.report(outcomes=True), key))
-    # LiteLLM is to forward the edge's own query.
+    # LiteLLM forwards the query that the edge sends.
     first = [Uav(n) for n in range(FLEET)]
     make_missions(targets[1], first)
     load(targets[1], first, 1.0)
-    asked = httpx.get(f"{llm.url}/last").json()
-    chat = json.dumps({"model": "instant", "messages": asked["messages"], "temperature": 0, "max_tokens": 12}).encode()
+    query = httpx.get(f"{llm.url}/last").json()
+    chat = json.dumps({"model": "instant", "messages": query["messages"], "temperature": 0, "max_tokens": 12}).encode()
     if (program := litellm_program(options.litellm)) is not None:
         targets.append(_litellm(program, folder, upstream, chat, stack))
     return [Target("direct", llm, lambda _: chat, path="/v1/chat/completions"), *targets]
@@ -141,11 +141,11 @@ def measured(targets: list[Target], options: Overhead) -> Figures:
 
 def compared(found: Figures, name: str, other: str, count: int, quantity: str) -> list[float]:
     """A ratio with its interval over rounds."""
-    mine, its, direct = (np.array([each[quantity] for each in found[n, count]]) for n in (name, other, "direct"))
+    ours, theirs, direct = (np.array([each[quantity] for each in found[n, count]]) for n in (name, other, "direct"))
     if quantity in ("p50", "p99"):
-        mine, its = mine - direct, its - direct
-    told = next(p for p in paired(name, other, quantity, list(mine), list(its)) if p.kind == "ratio")
-    return [round(value, 2) for value in (told.mean, told.low, told.high)]
+        ours, theirs = ours - direct, theirs - direct
+    ratio = next(p for p in paired(name, other, quantity, list(ours), list(theirs)) if p.kind == "ratio")
+    return [round(value, 2) for value in (ratio.mean, ratio.low, ratio.high)]
 
 
 def measure(options: Overhead) -> Report:
@@ -158,17 +158,17 @@ def measure(options: Overhead) -> Report:
     for (name, count), rounds in sorted(found.items(), key=lambda each: each[0][1]):
         row = {q: round(float(np.median([each[q] for each in rounds])), 2) for q in QUANTITIES}
         rows.append({"service": name, "uavs": count, **row})
-        # `before` does all that `edge` does.
+        # Only `edge` is compared with `before`, which does the same.
         for other in (o for o in GOALS if (o, count) in found and (name == "edge" or o != "before")):
             if not name.startswith("edge"):
                 continue
-            told = {quantity: compared(found, name, other, count, quantity) for quantity in QUANTITIES}
-            rows[-1][f"to {other}"] = told
+            to_other = {quantity: compared(found, name, other, count, quantity) for quantity in QUANTITIES}
+            rows[-1][f"to {other}"] = to_other
             pair = f"{count} UAVs, {name}, to {other}"
-            ratios[pair] = {RATIOS[quantity]: ratio for quantity, ratio in told.items()}
+            ratios[pair] = {RATIOS[quantity]: ratio for quantity, ratio in to_other.items()}
             if limits := GOALS[other]:
-                goals += [Goal(f"{pair}: {RATIOS[q]}", told[q], most=limits[0]) for q in ("p50", "p99")]
-                goals.append(Goal(f"{pair}: {RATIOS['rps']}", told["rps"], least=limits[1]))
+                goals += [Goal(f"{pair}: {RATIOS[q]}", to_other[q], most=limits[0]) for q in ("p50", "p99")]
+                goals.append(Goal(f"{pair}: {RATIOS['rps']}", to_other["rps"], least=limits[1]))
     taken = {f"{row['uavs']} UAVs, {row['service']}": {QUANTITIES[q]: row[q] for q in QUANTITIES} for row in rows}
     figures = {"rounds": options.rounds, "rows": rows}
     return Report(figures, {"Medians over rounds": taken, "Ratios [95% interval]": ratios}, goals)

@@ -49,7 +49,7 @@ class Smoothness(Options):
     """UAVs that get a decision at every update."""
 
 
-def reported(step: int, sensors: int, uavs: int) -> dict[str, Any]:
+def batch_body(step: int, sensors: int, uavs: int) -> dict[str, Any]:
     """The body of a batch: UAVs that fly east over a grid of sensors."""
     side = int(np.ceil(np.sqrt(sensors)))
     columns = {
@@ -67,19 +67,19 @@ def reported(step: int, sensors: int, uavs: int) -> dict[str, Any]:
 
 
 def fly(url: str, options: Smoothness, stop: threading.Event) -> None:
-    """Ask for the fleet's decisions, at most ten times a second."""
+    """Request the fleet's decisions, at most ten times a second."""
     with httpx.Client(base_url=url, timeout=60) as client:
         began, step = time.monotonic(), 1
         while not stop.is_set():
-            client.post("/decide/batch", json=reported(step, options.sensors, options.uavs)).raise_for_status()
+            client.post("/decide/batch", json=batch_body(step, options.sensors, options.uavs)).raise_for_status()
             time.sleep(max(0.0, began + step / UPDATES_A_SECOND - time.monotonic()))
             step += 1
 
 
 def main_thread_s(session: CDPSession) -> float:
     """Processor seconds of the page's main thread, painting in software included."""
-    found = {one["name"]: float(one["value"]) for one in session.send("Performance.getMetrics")["metrics"]}
-    return found["TaskDuration"]
+    metrics = {m["name"]: float(m["value"]) for m in session.send("Performance.getMetrics")["metrics"]}
+    return metrics["TaskDuration"]
 
 
 def watched(page: Page, seconds: float) -> dict[str, float]:
@@ -107,7 +107,7 @@ def measure(options: Smoothness) -> Report:
         spec = {"scenario": {"name": "many", "sensors": options.sensors, "uavs": options.uavs}}
         with httpx.Client(base_url=server.url, timeout=60) as client:
             client.put("/missions/many", json=spec).raise_for_status()
-            client.post("/decide/batch", json=reported(0, options.sensors, options.uavs)).raise_for_status()
+            client.post("/decide/batch", json=batch_body(0, options.sensors, options.uavs)).raise_for_status()
         try:
             with sync_playwright() as playwright:
                 browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)

@@ -1,4 +1,4 @@
-"""The time of a decision with the planner on, in modes ``policy`` and ``guided``, beside another commit's.
+"""The time of a decision with the planner on, in modes ``policy`` and ``guided``, compared with another commit's.
 
     python -m benchmarks.planning
     python -m benchmarks.planning --before DIR --rounds 30
@@ -32,7 +32,7 @@ from simulator.flying.flight import fly
 from simulator.flying.pilots import EdgePilot
 
 QUANTITIES = {"p50_ms": "p50, ms", "p95_ms": "p95, ms", "cpu_ms": "processor ms a decision", "lost": "lost packets"}
-# No clock ends a search: how much a plan loses is not to depend on the machine.
+# No clock ends a search, so that the losses of a plan do not depend on the machine.
 SETTINGS = {"STORE": "none", "PLANNER_MS": "30000"}
 PATIENCE_S = 60.0
 
@@ -54,7 +54,7 @@ class Planning(Options):
 
 
 def flown(edge: Server, scenario: str, mode: Mode, seed: int) -> dict[str, float]:
-    """One mission's quantities; raises ``SystemExit`` where the edge left one out."""
+    """One mission's quantities; raises ``SystemExit`` if an answer lacks one."""
     site, name = site_from_options(scenario, None), f"{scenario}-{mode}-{seed}"
     busy_s = edge.processor_s()
     with EdgeClient(edge.url, timeout_s=PATIENCE_S) as client:
@@ -78,10 +78,10 @@ def rows_of(scenario: str, mode: Mode, found: dict[str, list[dict[str, float]]])
     for name, worlds in found.items():
         row: dict[str, Any] = {"scenario": scenario, "mode": mode, "edge": name}
         for quantity in QUANTITIES:
-            mine, its = ([world[quantity] for world in flights] for flights in (worlds, found[first]))
-            row[quantity] = interval(mine).model_dump()
+            ours, theirs = ([world[quantity] for world in flights] for flights in (worlds, found[first]))
+            row[quantity] = interval(ours).model_dump()
             if name != first:
-                pair = next(p for p in paired(name, first, quantity, mine, its) if p.kind == "ratio")
+                pair = next(p for p in paired(name, first, quantity, ours, theirs) if p.kind == "ratio")
                 row[f"{quantity} to {first}"] = [round(value, 3) for value in (pair.mean, pair.low, pair.high)]
         rows.append(row)
     return rows

@@ -4,7 +4,7 @@
     python -m benchmarks.questions --page docs/results/benchmarks.md
 
 1. What does the edge add to an LLM server's latency? Beside a bare forwarder and LiteLLM's proxy, in the same rounds.
-2. What does a decision cost, by mode? In processor time, beside the bare forwarder's for a request.
+2. What does a decision cost, by mode? In processor time, compared with a bare forwarder's for a request.
 3. How does that grow with sensors, UAVs and missions?
 4. How long does a start take? Beside the imports of numba and FastAPI.
 5. What does the embedded LLM take? Beside the same LLM with one thread, and with an empty prefix cache.
@@ -49,7 +49,7 @@ class Questions(Options):
     litellm: str = "install"
     """`install`, the path of a `litellm` program, or `none`."""
     page: Path | None = None
-    """A page whose five tables are written anew."""
+    """A page whose five tables are replaced."""
 
 
 def measure(args: Questions) -> Report:
@@ -96,20 +96,20 @@ def _added(rows: Mapping[tuple[str, int], Mapping[str, Any]]) -> Rows:
 
 
 def _by_mode(modes: Mapping[str, Mapping[str, float]], bare_ms: float) -> Rows:
-    """Processor time, beside a bare forwarder's."""
+    """Processor time by mode, and its ratio to a bare forwarder's."""
     return {
         f"mode `{mode.partition(',')[0]}`,{mode.partition(',')[2]}": {
-            "processor ms": 1e3 * told["edge_s"],
-            "to a bare forwarder's request": 1e3 * told["edge_s"] / bare_ms,
+            "processor ms": 1e3 * costs["edge_s"],
+            "to a bare forwarder's request": 1e3 * costs["edge_s"] / bare_ms,
         }
-        for mode, told in modes.items()
+        for mode, costs in modes.items()
     }
 
 
 def _growth(
     rows: Mapping[tuple[str, int], Mapping[str, Any]], by_sensors: Mapping[str, Any], by_missions: Mapping[str, Any]
 ) -> Rows:
-    """Each cost at the most, to that at the fewest."""
+    """The ratio of each cost with more sensors, UAVs or missions to that with the fewest."""
     found: dict[str, dict[str, Cell]] = {
         f"{most:,} sensors to {_SENSORS[0]}: the edge's share of a decision, mode `{mode}`": {
             "ratio": ratios[str(most)]
@@ -129,10 +129,10 @@ def _growth(
 
 
 def _starts(figures: Mapping[str, Any]) -> Rows:
-    """Seconds of the starts that a user waits for, beside the imports."""
-    told = figures["median_s"]
+    """Seconds of each start that a user waits for, and their ratio to the imports alone."""
+    medians = figures["median_s"]
     return {
-        name: {"seconds": told[each], "to the imports": told[each] / told[startup.IMPORTS]}
+        name: {"seconds": medians[each], "to the imports": medians[each] / medians[startup.IMPORTS]}
         for each, name in (
             (startup.IMPORTS, f"`python -c '{startup.IMPORTS}'`"),
             (startup.HEALTHZ, "`aicvds serve` until `/healthz` answers"),
@@ -148,7 +148,7 @@ def _llm(figures: Mapping[str, Any]) -> Rows:
 
 
 def markdown(tables: Mapping[str, Rows]) -> str:
-    """The tables for a page."""
+    """The tables as Markdown."""
     text = ""
     for title, rows in tables.items():
         columns = list(dict.fromkeys(column for row in rows.values() for column in row))
@@ -159,16 +159,16 @@ def markdown(tables: Mapping[str, Rows]) -> str:
 
 
 def write(page: Path, tables: Mapping[str, Rows]) -> None:
-    """Write the tables into a page, and their numbers into a CSV beside it: an interval is its middle, low and high.
+    """Write the tables into a page, and their numbers into a CSV file: an interval as middle, low and high.
 
     Raises:
-        ValueError: the page has no place for them.
+        ValueError: the page lacks the markers of the tables.
     """
     text = page.read_text(encoding="utf-8")
     place = re.compile(f"{re.escape(_BEGIN)}\n.*{re.escape(_END)}", re.DOTALL)
     if not place.search(text):
         raise ValueError(f"{page} has no lines {_BEGIN} and {_END}")
-    # Before the page makes the tree differ from it.
+    # Read before the page changes, which would mark the commit as dirty.
     measured = commit()
     made = f"{_BEGIN}\n{markdown(tables)}\n{_END}"
     page.write_text(place.sub(lambda _: made, text), encoding="utf-8")

@@ -6,7 +6,7 @@ It flies missions of 10 to 2,000 sensors in turn against real edges with a store
 LLM, and one of mode ``llm`` whose LLM (``instant_llm.py``) answers at once. The share is the edge's own time,
 ``latency_ms``, less the LLM's. The round trip, also less the LLM's time, includes HTTP and parsing. Decisions of the
 LLM-free policy, for example without a heard sensor, are counted and omitted. Every request has the last decision's
-outcome. Its learning may run beside the next decision, but earlier learning is finished, because a UAV asks once in
+outcome. Learning from it may overlap the next decision, but earlier learning is finished, because a UAV asks once in
 ten seconds.
 
 Then it measures requests: the bytes of one request on each uplink (``full``, ``delta``, ``pruned``), as the clients
@@ -41,11 +41,11 @@ from simulator.flying.pilots import EdgePilot, PilotChoice
 from simulator.sites.site import Site
 from simulator.world.observation import Observation
 
-# The highest ratio of the shares, by the number of sensors, to that with the fewest; and the most memory.
+# The highest ratio of the share to that with the fewest sensors, by number of sensors; the most memory.
 GOALS, GOAL_MB = {1000: 2.0, 2000: 4.0}, 200.0
 UAVS = 3
 # The longest time for learning from one outcome.
-NO_LESSON_S = 5.0
+NO_LEARNING_S = 5.0
 ENCODINGS: dict[str, Callable[[bytes], bytes]] = {
     "plain": lambda body: body,
     "gzip": lambda body: gzip.compress(body, 6, mtime=0),
@@ -71,12 +71,12 @@ class Timed:
 
     mode: Mode
     server: Server
-    took: dict[int, list[dict[str, float]]] = field(default_factory=dict)
+    times_ms: dict[int, list[dict[str, float]]] = field(default_factory=dict)
     left_out: int = 0
 
     @property
     def url(self) -> str:
-        """The edge's."""
+        """The URL of the edge."""
         return self.server.url
 
     def peak_mb(self) -> float:
@@ -86,32 +86,33 @@ class Timed:
 
 
 class Pilot(EdgePilot):
-    """Asks after every earlier learning step has ended, and stores the requests."""
+    """Requests each decision after every earlier learning step has ended, and stores the requests."""
 
     def __init__(self, client: EdgeClient, edge: Timed, scenario: Scenario, mission_id: str) -> None:
         super().__init__(client, mission_id, scenario, 0, mode=edge.mode)
         self._status = f"{edge.url}/missions/{mission_id}"
-        self._untaught = 0
+        self._skipped = 0
         self.requests: list[DecideRequest] = []
         self.on_request = self.requests.append
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
         """The edge's choice."""
         known, since = -1, time.monotonic()
-        while (told := httpx.get(self._status, timeout=60).json())["feedback"] - self._untaught > told[
-            "learner_updates"
-        ]:
-            if told["learner_updates"] != known:
-                known, since = told["learner_updates"], time.monotonic()
-            elif time.monotonic() > since + NO_LESSON_S:
-                # The modules learn nothing from a decision without their part.
-                self._untaught = told["feedback"] - known
+        while True:
+            status = httpx.get(self._status, timeout=60).json()
+            if status["feedback"] - self._skipped <= status["learner_updates"]:
+                break
+            if status["learner_updates"] != known:
+                known, since = status["learner_updates"], time.monotonic()
+            elif time.monotonic() > since + NO_LEARNING_S:
+                # The modules do not learn from a decision in which they took no part.
+                self._skipped = status["feedback"] - known
             time.sleep(0.005)
         return super().decide(uav, observation, taken)
 
 
 def flown(edge: Timed, sensors: int, steps: int, name: str) -> list[DecideRequest]:
-    """Fly one mission, note the times of its decisions, and delete it; returns its requests."""
+    """Fly one mission, record the times of its decisions, and delete it; returns its requests."""
     scenario = Scenario(sensors=sensors, steps=steps)
     with EdgeClient(edge.url, timeout_s=60) as client:
         pilot = Pilot(client, edge, scenario, name)
@@ -123,7 +124,7 @@ def flown(edge: Timed, sensors: int, steps: int, name: str) -> list[DecideReques
             continue
         llm = decision.latency_ms.get("llm", 0.0)
         own = {"share": decision.latency_ms["total"] - llm, "round_trip": decision.rtt_ms - llm}
-        edge.took.setdefault(sensors, []).append({**decision.latency_ms, **own})
+        edge.times_ms.setdefault(sensors, []).append({**decision.latency_ms, **own})
     httpx.delete(f"{edge.url}/missions/{name}", timeout=60).raise_for_status()
     return pilot.requests
 
@@ -157,9 +158,9 @@ def wire(url: str, now: DecideRequest, before: DecideRequest, repeats: int) -> d
                 headers |= {} if encoding == "plain" else {"Content-Encoding": encoding}
                 content = ENCODINGS[encoding](bodies[rows])
                 began = time.perf_counter()
-                told = http.post("/decide", content=content, headers=headers)
+                response = http.post("/decide", content=content, headers=headers)
                 took[rows, encoding].append((time.perf_counter() - began) * 1e3)
-                assert told.status_code == 404 and "outcome.decision_id" in told.text, told.text
+                assert response.status_code == 404 and "outcome.decision_id" in response.text, response.text
         http.delete(f"/missions/{name}").raise_for_status()
     for (rows, encoding), times in took.items():
         found[rows][encoding] = {
@@ -183,7 +184,7 @@ def measure(args: Sensors) -> Report:
             server = stack.enter_context(edge({"MODE": mode, "LOG_LEVEL": "error", **more}))
             edges.append(Timed(mode, server))
             flown(edges[-1], args.sensors[0], args.steps, "warm-up")
-            edges[-1].took, edges[-1].left_out = {}, 0
+            edges[-1].times_ms, edges[-1].left_out = {}, 0
 
         def flying(timed: Timed, sensors: int) -> Callable[[int], None]:
             def flight(number: int) -> None:
@@ -195,7 +196,7 @@ def measure(args: Sensors) -> Report:
             return flight
 
         in_turn({(sensors, e.mode): flying(e, sensors) for sensors in args.sensors for e in edges}, args.rounds)
-    took = {e.mode: {str(sensors): _summary(e.took[sensors]) for sensors in args.sensors} for e in edges}
+    took = {e.mode: {str(sensors): _summary(e.times_ms[sensors]) for sensors in args.sensors} for e in edges}
     found: dict[str, Any] = {
         "decisions_each": UAVS * args.steps * args.rounds,
         "left_out": {e.mode: e.left_out for e in edges},
@@ -221,8 +222,8 @@ def _summary(took: list[dict[str, float]]) -> dict[str, Any]:
     return {"p50": medians, "share_p95": round(float(np.percentile([one["share"] for one in took], 95)), 3)}
 
 
-def _ratios(by_sensors: dict[str, Any], what: str) -> dict[str, float]:
-    p50 = {sensors: told["p50"][what] for sensors, told in by_sensors.items()}
+def _ratios(by_sensors: dict[str, Any], quantity: str) -> dict[str, float]:
+    p50 = {sensors: times["p50"][quantity] for sensors, times in by_sensors.items()}
     first = next(iter(p50.values()))
     return {sensors: round(value / first, 2) for sensors, value in p50.items()}
 
@@ -230,28 +231,28 @@ def _ratios(by_sensors: dict[str, Any], what: str) -> dict[str, float]:
 def _tables(found: dict[str, Any]) -> dict[str, dict[str, dict[str, Cell]]]:
     stages, sizes, pruned = {}, {}, {}
     for mode, by_sensors in found["took_ms"].items():
-        for sensors, told in by_sensors.items():
-            p50 = told["p50"]
+        for sensors, times in by_sensors.items():
+            p50 = times["p50"]
             own = {s: v for s, v in p50.items() if s not in ("total", "share", "round_trip", "llm")}
             stages[f"J = {sensors}, {mode}"] = {
                 "share p50 ms": p50["share"],
                 "ratio": found["share_ratio"][mode][sensors],
-                "p95": told["share_p95"],
+                "p95": times["share_p95"],
                 "round trip": p50["round_trip"],
                 "its ratio": found["round_trip_ratio"][mode][sensors],
                 "most of it": ", ".join(f"{s} {own[s]:.1f}" for s in sorted(own, key=lambda s: -own[s])[:3]),
                 "memory MB": found["peak_memory_growth_mb"][sensors] if mode == "value" else "",
             }
     for sensors, payloads in found["wire"].items():
-        for uplink, told in payloads.items():
-            sizes[f"J = {sensors}, {uplink}, {told['sensors']} rows"] = {
-                f"{e} {label}": told[e][what]
+        for uplink, payload in payloads.items():
+            sizes[f"J = {sensors}, {uplink}, {payload['sensors']} rows"] = {
+                f"{e} {label}": payload[e][quantity]
                 for e in ENCODINGS
-                for what, label in (("bytes", "bytes"), ("read_ms", "ms"))
+                for quantity, label in (("bytes", "bytes"), ("read_ms", "ms"))
             }
-        told = payloads["pruned"]
-        weights = {f"weights, {encoding}": size for encoding, size in told["weights_bytes"].items()}
-        pruned[f"J = {sensors}"] = {"ms on board": told["onboard_ms"], **weights}
+        payload = payloads["pruned"]
+        weights = {f"weights, {encoding}": size for encoding, size in payload["weights_bytes"].items()}
+        pruned[f"J = {sensors}"] = {"ms on board": payload["onboard_ms"], **weights}
     return {"Share of a decision": stages, "A request": sizes, "Uplink pruned": pruned}
 
 

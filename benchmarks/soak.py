@@ -1,17 +1,17 @@
-"""A long flight of 200 missions against one edge, with hostile clients: does what it uses stay bounded?
+"""A long flight of 200 missions against one edge, with hostile clients: do its resources stay bounded?
 
     python -m benchmarks.soak --minutes 60
 
 It starts an edge with its embedded LLM and a store, and flies 198 missions of mode ``value`` and 2 of mode ``guided``
 at the same time, with outcomes, request keys, retries and sometimes a deleted mission. A mission's memory is bounded,
-and full after some 300 outcomes. The resident memory is a peak, and rises ever more seldom after that. So the edge
+and full after some 300 outcomes. The resident memory is a peak, and rises less and less often after that. So the edge
 first flies at full speed, for 900 outcomes of every mission (300 of those that ask the LLM). Then it flies at the pace
 of the paper's world, a step of every mission in 10 s, and the measurement begins after 4 minutes of that pace;
 ``--pace-s 0`` measures at full speed. The results are the slope of the resident memory, by least squares over medians
 of 20 parts (an LLM's call takes 8 MB and returns them), with its 95% interval, the count of tasks, connections and open
-files before and after the hostile clients, lost outcomes, late and unstored decisions beside them, and the sources of
-mode ``guided``'s decisions. It prints them, and writes the same as JSON. The hostile clients are there while it settles
-and measures: they do not read, read or write a byte a second, or vanish. ``--guided 0`` shows the edge without the
+files before and after the hostile clients, lost outcomes, late and unstored decisions, and the sources of mode
+``guided``'s decisions. It prints them, and writes the same as JSON. The hostile clients run in the settling time and in
+the measurement: they do not read, read or write a byte a second, or vanish. ``--guided 0`` shows the edge without the
 LLM's own memory.
 """
 
@@ -93,30 +93,30 @@ class Worker(threading.Thread):
     def __init__(self, edge: Server, missions: list[Mission], seed: int) -> None:
         super().__init__(daemon=True)
         self._radio, self._missions, self._random = Radio(edge, seed), missions, random.Random(seed)
-        self.over = False
+        self.stopped = False
         self.pace_s = 0.0
         self.error: str | None = None
 
     def run(self) -> None:
         try:
-            while not self.over:
+            while not self.stopped:
                 began = time.monotonic()
                 for flown, mission in enumerate(self._missions, 1):
                     self._step(mission)
                     due = began + self.pace_s * flown / len(self._missions)
-                    while not self.over and (left := due - time.monotonic()) > 0:
+                    while not self.stopped and (left := due - time.monotonic()) > 0:
                         time.sleep(min(left, 1.0))
         except (OSError, http.client.HTTPException, KeyError, SystemExit) as error:
-            if not self.over:
+            if not self.stopped:
                 self.error = repr(error)
 
     def _step(self, mission: Mission) -> None:
         if self._random.randrange(DELETED_ONE_IN) == 0 and mission.step:
             self._radio.post(f"/missions/{mission.name}", {}, "DELETE")
-            self._radio.made(mission.name, mission.mode)
-            mission.owed.clear()
+            self._radio.create(mission.name, mission.mode)
+            mission.outcomes.clear()
             mission.reported = 0
-        reported = len(mission.owed)
+        reported = len(mission.outcomes)
         decisions = self._radio.step(mission, attempts=1 + (self._random.randrange(20) == 0))
         mission.reported += reported
         mission.unstored += sum(not decision["stored"] for decision in decisions)
@@ -124,13 +124,13 @@ class Worker(threading.Thread):
 
 
 def metric(edge: Server, name: str) -> float:
-    """The present value of a metric without labels."""
+    """The current value of a metric without labels."""
     lines = httpx.get(f"{edge.url}/metrics", timeout=30).text.splitlines()
     return next(float(line.split()[1]) for line in lines if line.startswith(f"{name} "))
 
 
 def sample(edge: Server, began: float) -> Sample:
-    """The edge's present resources."""
+    """The edge's current resources."""
     return Sample(
         at_s=time.monotonic() - began,
         resident_mb=edge.resident_bytes() / 1e6,
@@ -153,7 +153,7 @@ def slope(samples: list[Sample]) -> tuple[float, float]:
 
 
 def measure(options: Soak) -> Report:
-    """Fly; the report's goals say whether anything grows."""
+    """Fly; the goals of the report limit the growth."""
     missions = [Mission(f"soak{n}", mode="guided" if n < options.guided else "value") for n in range(options.missions)]
     with edge({"LOG_LEVEL": "error", **({} if options.guided else {"MODE": "value"})}) as server:
         samples, counts, ended, late = _fly(server, missions, options)
@@ -194,14 +194,14 @@ def _fly(
     The last value is the number of late decisions since the hostile clients came.
     """
     for mission in missions:
-        Radio(edge, 0).made(mission.name, mission.mode)
+        Radio(edge, 0).create(mission.name, mission.mode)
     guided, others = missions[: options.guided], missions[options.guided :]
     shares = [share for share in (guided, *(others[n::WORKERS] for n in range(WORKERS))) if share]
     workers = [Worker(edge, share, seed) for seed, share in enumerate(shares)]
     for worker in workers:
         worker.start()
     warm = dict(zip(("value", "guided"), options.warm, strict=True))
-    _watch(workers, "warming up", 1.0, lambda: min(mission.told / warm[mission.mode] for mission in missions))
+    _watch(workers, "warming up", 1.0, lambda: min(mission.decisions / warm[mission.mode] for mission in missions))
     for worker in workers:
         worker.pace_s = options.pace_s
 
@@ -216,7 +216,7 @@ def _fly(
         return samples
 
     before = sampled("counting", options.counted_s)
-    # At full speed the edge is overloaded on purpose.
+    # The warm-up overloads the edge on purpose, so its late decisions do not count.
     late = metric(edge, "aicvds_deadline_missed_total")
     for mission in missions:
         mission.unstored = 0
@@ -229,20 +229,20 @@ def _fly(
     late = metric(edge, "aicvds_deadline_missed_total") - late
     after = sampled("counting again", options.counted_s)
     for worker in workers:
-        worker.over = True
+        worker.stopped = True
     for worker in workers:
         worker.join(timeout=60)
     return samples, (before, after), ended, late
 
 
 def _watch(workers: list[Worker], label: str, pause_s: float, share: Callable[[], float]) -> None:
-    """Wait until the share that is done is 1; raises ``SystemExit`` if a worker failed."""
+    """Wait until the completed share is 1; raises ``SystemExit`` if a worker failed."""
     with Progress() as progress:
         task = progress.add_task(label, total=1.0)
         while (done := share()) < 1.0:
             progress.update(task, completed=done)
-            if faults := [worker.error for worker in workers if worker.error]:
-                raise SystemExit(f"soak: {faults[0]}")
+            if errors := [worker.error for worker in workers if worker.error]:
+                raise SystemExit(f"soak: {errors[0]}")
             time.sleep(pause_s)
         progress.update(task, completed=1.0)
 

@@ -1,4 +1,4 @@
-"""The time to start: `aicvds serve` beside the imports of its parts, and `--help` of every command.
+"""The time to start: `aicvds serve`, the imports of its parts, and `--help` of every command.
 
     python -m benchmarks.startup --rounds 10
 
@@ -82,7 +82,7 @@ def _timed(env: dict[str, str]) -> dict[str, Callable[[int], float]]:
         IMPORTS: lambda _: _ended([sys.executable, "-c", IMPORTS], env),
         HEALTHZ: lambda _: _served(env, lambda client: client.get("/healthz")),
         DECIDE: lambda _: _served(env, lambda client: client.post("/decide", json=_request())),
-        **{" ".join(words): lambda _, words=words: _ended([AICVDS, *words], env) for words in helps},  # type: ignore[misc]
+        **{" ".join(args): lambda _, args=args: _ended([AICVDS, *args], env) for args in helps},  # type: ignore[misc]
     }
 
 
@@ -115,10 +115,10 @@ def _edge(env: dict[str, str]) -> Iterator[tuple[httpx.Client, float]]:
         with subprocess.Popen(command, env=env, stderr=subprocess.PIPE, text=True) as process:
             assert process.stderr is not None
             try:
-                told = process.stderr.readline()
-                address = re.search(r"http://[\d.:]+", told)
+                line = process.stderr.readline()
+                address = re.search(r"http://[\d.:]+", line)
                 if address is None:
-                    raise SystemExit(f"aicvds serve did not start: {told}{process.stderr.read()}")
+                    raise SystemExit(f"aicvds serve did not start: {line}{process.stderr.read()}")
                 client.base_url = address[0]
                 yield client, began
             finally:

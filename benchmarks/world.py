@@ -1,4 +1,4 @@
-"""The speed of the world: a batch of worlds in numpy beside single worlds, on one core.
+"""The speed of the simulated world: a batch of worlds in numpy, and single worlds, on one core.
 
     python -m benchmarks.world --worlds 1024
 

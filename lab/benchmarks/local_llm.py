@@ -22,7 +22,7 @@ _CLOSE = {"Connection": "close"}
 
 
 @dataclass(frozen=True)
-class Answered:
+class TimedAnswer:
     """One answer: seconds to its first and last token, tokens from the prefix cache, newly read and written.
 
     ``cpu_s`` are this whole process's processor seconds, which a busy machine changes least. ``late``: the call was
@@ -74,7 +74,7 @@ class LocalLLM:
         body = {"content": text, "add_special": True, "parse_special": True}
         return [int(token) for token in self._post("/tokenize", body)["tokens"]]
 
-    def ask(self, body: dict[str, Any], limit_s: float = LIMIT_S, **changes: Any) -> Answered:
+    def ask(self, body: dict[str, Any], limit_s: float = LIMIT_S, **changes: Any) -> TimedAnswer:
         """One chat completion; ``changes`` are further fields of the request."""
         request = {**body, **changes, "stream": True, "stream_options": {"include_usage": True}}
         began, cpu = time.perf_counter(), time.process_time()
@@ -87,19 +87,19 @@ class LocalLLM:
                     raise SystemExit(f"the embedded LLM refused a request: {response.read().decode()[:200]}")
                 for line in response.iter_lines():
                     if time.perf_counter() - began > limit_s:
-                        return Answered(limit_s, first_s or limit_s, time.process_time() - cpu, text, late=True)
+                        return TimedAnswer(limit_s, first_s or limit_s, time.process_time() - cpu, text, late=True)
                     if not line.startswith("data: {"):
                         continue
-                    told = json.loads(line.removeprefix("data: "))
-                    timings = told.get("timings") or timings
-                    for choice in told["choices"]:
-                        text += (said := choice["delta"].get("content") or "")
-                        first_s = first_s or (time.perf_counter() - began if said else 0.0)
+                    chunk = json.loads(line.removeprefix("data: "))
+                    timings = chunk.get("timings") or timings
+                    for choice in chunk["choices"]:
+                        text += (content := choice["delta"].get("content") or "")
+                        first_s = first_s or (time.perf_counter() - began if content else 0.0)
         except httpx.TimeoutException:
-            return Answered(limit_s, first_s or limit_s, time.process_time() - cpu, text, late=True)
+            return TimedAnswer(limit_s, first_s or limit_s, time.process_time() - cpu, text, late=True)
         seconds = time.perf_counter() - began
         cached, new, written = (int(timings[name]) for name in ("cache_n", "prompt_n", "predicted_n"))
-        return Answered(seconds, first_s or seconds, time.process_time() - cpu, text, cached, new, written)
+        return TimedAnswer(seconds, first_s or seconds, time.process_time() - cpu, text, cached, new, written)
 
     def _post(self, path: str, body: dict[str, Any]) -> Any:
         return self._http.post(path, json=body).raise_for_status().json()
