@@ -1,9 +1,9 @@
-"""What a machine without this project's packages trains with: the embedded LLM's tensors, and the tokens of prompts.
+"""The inputs of training on a machine without this project's packages: the LLM's tensors, and the tokens of prompts.
 
     python -m lab.adapter.base --gguf SmolLM2-135M-Instruct.Q4_1.gguf --out runs/base
 
-It writes base0.npz and base1.npz, vocabulary.npz with the embeddings of all tokens, and tokens.json. Of a file of type
-Q8_0 they have 53, 53 and 28 MB.
+It writes base0.npz and base1.npz, vocabulary.npz with the embeddings of all tokens, and tokens.json. For a file of
+type Q8_0 the first three have 53, 53 and 28 MB.
 """
 
 from __future__ import annotations

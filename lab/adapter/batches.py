@@ -1,7 +1,7 @@
 """Batches of compact prompts with the teacher's probabilities, for any number of rows, from records on a GPU.
 
-Each time that a decision is drawn, its rows are shuffled, its sensors' signs are drawn anew, and it has a number of
-rows of its own. :func:`targets_of` defines the probabilities.
+Each time that a decision is drawn, its rows are shuffled, its sensors get new random signs, and its number of
+rows is drawn. :func:`targets_of` defines the probabilities.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 
 LETTERS = "ABCDEFGHIJKLMNOPQRST"
 _MOST_EXPERIENCES = 8
-# The columns of ``vel`` and ``lost`` that a prompt with so many options a row has.
+# By the number of options a row, the columns of ``vel`` and ``lost`` in the prompt.
 _COLUMNS = {4: [0, 1, 2, 3], 3: [0, 4, 3], 2: [0, 3], 1: [5]}
 _REFERENCE_SHARE, _AFTER_FAILURE, _HELD_OUT = 0.2, 0.15, 11
 # Packets of regret that make an answer e times less likely; and packets that a metre a second is worth.
@@ -30,9 +30,9 @@ _NINE_OF_FASTEST = 9 / 14
 class PromptBatch:
     """B prompts of r rows with V options: tokens ``(B, T)``, targets ``(B, r, V)``, the places of the rows' letters.
 
-    ``regret`` ``(B, r, V)`` is what each answer is expected to lose above the best of all sensors and options;
-    ``planned`` ``(B, r, V)`` whether it is the planner's, of which a prompt may have none. ``sensors`` ``(B, r)`` and
-    ``velocities`` ``(B, r, V)`` are the answers themselves, as a sensor's place in the records and in m/s.
+    ``regret`` ``(B, r, V)`` is the expected loss of each answer above the best of all sensors and options.
+    ``planned`` ``(B, r, V)`` is whether it is the planner's; a prompt may have no such answer. ``sensors`` ``(B, r)``
+    and ``velocities`` ``(B, r, V)`` are the answers themselves, as a sensor's place in the records and in m/s.
     """
 
     tokens: Tensor
@@ -81,7 +81,7 @@ class RecordTensors:
         self._members = lru_cache(maxsize=None)(self._members_of)
 
     def groups(self, k: int, experiences: int, *, held_out: bool = False) -> dict[int, Tensor]:
-        """The decisions that have so many experiences, by the rows that a prompt of at most k shows."""
+        """The decisions with this number of experiences, by the rows of a prompt of at most k rows."""
         return self._members(k, experiences, held_out)
 
     def _members_of(self, k: int, experiences: int, held_out: bool) -> dict[int, Tensor]:
@@ -89,12 +89,12 @@ class RecordTensors:
         return self.shown(own[self.experiences[own] == experiences], k)
 
     def shown(self, which: Tensor, k: int) -> dict[int, Tensor]:
-        """These decisions, by the rows that a prompt of at most k shows."""
+        """These decisions, by the rows of a prompt of at most k rows."""
         shown = self._of["n"][which].clamp(max=k)
         return {int(rows): which[shown == rows] for rows in shown.unique().tolist()}
 
     def batch(self, which: Tensor, k: int, rows: int, experiences: int, drawn: torch.Generator) -> PromptBatch:
-        """The prompts of these decisions, all of so many rows and experiences."""
+        """The prompts of these decisions, all with ``rows`` rows and ``experiences`` experiences."""
         own, count, tokens = {name: one[which] for name, one in self._of.items()}, len(which), self._tokens
         columns = torch.tensor(_COLUMNS[max(1, min(4, len(LETTERS) // k))], device=self._device)
         order = torch.rand(count, rows, device=self._device, generator=drawn).argsort(1)
@@ -141,10 +141,10 @@ def _planned(velocities: Tensor, is_sensor: Tensor, velocity: Tensor) -> Tensor:
 
 
 def targets_of(lost: Tensor, velocities: Tensor, planned: Tensor, failing: Tensor) -> Tensor:
-    """By regret, and a share for the planner's sensor; within a sensor by regret alone.
+    """Probabilities by regret, and a share for the planner's sensor; within a sensor by regret alone.
 
-    More than half of the options lose nothing in any of the evaluator's futures. Among these the faster one is to be
-    learned: a student that spreads over them has no reason for any velocity, and its likeliest answer is arbitrary.
+    More than half of the options lose nothing in any of the evaluator's futures. The student learns the faster one
+    of these: a student that spreads over them has no reason for any velocity, and its likeliest answer is arbitrary.
     """
     worth = lost - _WORTH_OF_VELOCITY * velocities
     times = (velocities[..., :, None] == velocities[..., None, :]).sum(dim=-1)

@@ -42,7 +42,7 @@ from shared.world.scenario import Scenario
 from shared.world.step_rule import Action
 
 ROWS, OPTIONS = 10, 6
-# Belief and experiences of a recording's missions, one after the other: most have a learned belief, as by default.
+# Belief and experiences of a recording's missions, in turn; most have a learned belief, as by default.
 _VIEWS = [("fleet", 0)] * 7 + [("reported", 8), ("fleet", 8), ("reported", 0)]
 _NEVER = 1e4
 

@@ -1,11 +1,11 @@
-"""Record decisions in the states that the adapted LLM brings about (DAgger, Ross et al. 2011).
+"""Record decisions in the states that the adapted LLM's own decisions lead to (DAgger, Ross et al. 2011).
 
     python -m lab.adapter.student_flights --scenario paper --first 60000 --missions 32 --base runs/base \
         --adapter runs/adapter/adapter.npz --out runs/own/paper.npz
 
 The UAVs fly the likeliest answer of the LLM, for whose prompts k is 3, 5, 7 or 10 by mission. The planner's action and
 the rollout evaluator's losses in each of its states are recorded as :mod:`lab.adapter.records` says. The missions fly
-side by side, so that one batch has a prompt of each.
+concurrently, so that one batch has a prompt of each.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from simulator.world.observation import decide_request
 
 _ROWS = (5, 3, 5, 7, 5, 10)
 
-# Yields each record of a mission, and is sent the action that is flown.
+# A generator that yields each record of a mission, and receives the action to fly.
 _Flight = Generator[Record, Action, None]
 
 
@@ -59,9 +59,9 @@ class StudentAnswers:
         """The likeliest answers."""
         tensors = RecordTensors({name: np.array([one[name] for one in records]) for name in records[0]}, self._tokens)
         chosen: dict[int, Action] = {}
-        everyone = torch.arange(len(records))
+        numbers = torch.arange(len(records))
         for experiences in tensors.experiences.unique().tolist():
-            for rows, which in tensors.shown(everyone[tensors.experiences == experiences], k).items():
+            for rows, which in tensors.shown(numbers[tensors.experiences == experiences], k).items():
                 batch = tensors.batch(which, k, rows, experiences, self._drawn)
                 states = self._model(batch.tokens, self._layers)[:, -1]
                 answers = self._model.logits(states, self._tokens.letters[: batch.velocities[0].numel()]).argmax(1)
@@ -106,7 +106,7 @@ def flight_of(scenario: Scenario, number: int) -> _Flight:
 
 
 def records_of_flights(scenario: Scenario, missions: Sequence[int], answers: Answers) -> list[Record]:
-    """Fly the missions side by side."""
+    """Fly the missions concurrently; returns the records of their decisions."""
     records: list[Record] = []
     flights = {number: flight_of(scenario, number) for number in missions}
     waiting = {number: next(flight) for number, flight in flights.items()}

@@ -1,4 +1,4 @@
-"""Train the adapter for any number of rows, on one large GPU or on a processor, for so many seconds.
+"""Train the adapter for any number of rows, on one large GPU or on a processor, for a given time.
 
     python -m lab.adapter.train --records lab/adapter/decisions.npz --base runs/base --seconds 480 --out runs/adapter
     python -m lab.adapter.train --records lab/adapter/*.npz --base runs/base --begin runs/begin.npz --seconds 3600 \
@@ -24,7 +24,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from lab.adapter.batches import PromptBatch, PromptTokens, RecordTensors
 from lab.adapter.model import Layer, Model
 
-# How often a prompt may show at most 1, 2, ... 10 rows.
+# The weights of the prompts with at most 1, 2, ... 10 rows.
 _SHARES = np.array([2, 3, 20, 6, 30, 5, 12, 4, 4, 14], dtype=float)
 _EXPERIENCED_SHARE = 0.6
 _WARM_UP, _LEAST_RATE = 60, 0.02
@@ -36,8 +36,8 @@ _CHECKPOINT_S = 60.0
 def loss_of(model: Model, layers: Sequence[Layer], tokens: PromptTokens, batch: PromptBatch) -> Tensor:
     """The loss of :mod:`lab.distilling.loss`: the answer, its sensor, each row's letter and each row's worth.
 
-    To it comes the probability, among all tokens, that the answer is an offered letter: most LLM servers constrain
-    nothing.
+    A further term is the probability, among all tokens, of an offered letter as the answer, because most LLM servers
+    do not constrain it.
     """
     rows, options = batch.targets.shape[1:]
     states = model(batch.tokens, layers)
@@ -71,7 +71,7 @@ def evaluation(model: Model, tokens: PromptTokens, records: RecordTensors, most:
                 states = model(batch.tokens, layers)[:, -1]
                 options = batch.targets.shape[2]
                 logits = model.logits(states, tokens.letters[: rows * options])
-                # The two products are rounded each in its own way.
+                # The two products differ by rounding.
                 offered.append(logits.amax(1) >= model.all_logits(states).amax(1) - _TINY_LOGIT)
                 chosen = logits.argmax(1, keepdim=True)
                 regret.append(batch.regret.flatten(1).gather(1, chosen)[:, 0])
@@ -86,7 +86,7 @@ def evaluation(model: Model, tokens: PromptTokens, records: RecordTensors, most:
 
 
 class Draws:
-    """Batches at random, each of one number of rows and of experiences."""
+    """Random batches, each of prompts with the same numbers of rows and experiences."""
 
     def __init__(self, tokens: PromptTokens, records: RecordTensors, device: str, seed: int) -> None:
         self._records = records
@@ -96,7 +96,7 @@ class Draws:
         self._experiences = many * np.where(np.arange(9), _EXPERIENCED_SHARE, 1.0)
 
     def batch(self, size: int) -> PromptBatch:
-        """A batch of so many tokens."""
+        """A batch of about ``size`` tokens."""
         k = int(self._draws.choice(10, p=_SHARES / _SHARES.sum())) + 1
         experiences = int(self._draws.choice(9, p=self._experiences / self._experiences.sum()))
         groups = self._records.groups(k, experiences)
@@ -109,19 +109,19 @@ class Draws:
 
 
 def train(model: Model, tokens: PromptTokens, records: RecordTensors, args: argparse.Namespace, device: str) -> None:
-    """Train for a time, or for the rest of it; the learning rate follows it along a cosine."""
+    """Train for a time, or for its rest after the checkpoint; the learning rate falls along a cosine."""
     weights = [weight for weight in model.parameters() if weight.requires_grad]
     optimizer = torch.optim.AdamW(weights, lr=args.rate, betas=(0.9, 0.98), weight_decay=0.0)
-    spent, step, checkpoint = 0.0, 0, args.out / "checkpoint.pt"
+    spent_s, step, checkpoint = 0.0, 0, args.out / "checkpoint.pt"
     if checkpoint.is_file():
         found = torch.load(checkpoint, weights_only=True)
-        spent, step = found["spent"], found["step"]
+        spent_s, step = found["spent"], found["step"]
         model.load_state_dict(found["model"], strict=False)
         optimizer.load_state_dict(found["optimizer"])
     draws = Draws(tokens, records, device, step)
     begun = written = time.monotonic()
     losses: list[float] = []
-    while (done := (spent + time.monotonic() - begun) / args.seconds) < 1.0:
+    while (done := (spent_s + time.monotonic() - begun) / args.seconds) < 1.0:
         fallen = _LEAST_RATE + (1 - _LEAST_RATE) * 0.5 * (1 + math.cos(math.pi * done))
         for group in optimizer.param_groups:
             group["lr"] = args.rate * min(1.0, (step + 1) / _WARM_UP) * fallen
@@ -139,10 +139,10 @@ def train(model: Model, tokens: PromptTokens, records: RecordTensors, args: argp
             written, half = now, checkpoint.with_suffix(".part")
             own = {name: weight for name, weight in model.named_parameters() if weight.requires_grad}
             torch.save(
-                {"spent": spent + now - begun, "step": step, "model": own, "optimizer": optimizer.state_dict()}, half
+                {"spent": spent_s + now - begun, "step": step, "model": own, "optimizer": optimizer.state_dict()}, half
             )
             half.replace(checkpoint)
-            print(f"{step} steps, {spent + now - begun:.0f} s: loss {np.mean(losses):.3f}", flush=True)
+            print(f"{step} steps, {spent_s + now - begun:.0f} s: loss {np.mean(losses):.3f}", flush=True)
             losses = []
 
 

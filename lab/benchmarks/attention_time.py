@@ -1,4 +1,4 @@
-"""Microseconds of attention over J sensors, beside its complexity O(J d_x d' + J^2 d') in the paper.
+"""Microseconds of attention over J sensors, compared with its complexity O(J d_x d' + J^2 d') in the paper.
 
 python -m lab.benchmarks.attention_time
 """

@@ -1,4 +1,4 @@
-"""Whether shortening a prompt saves time: by a compressor of LLMLingua-2's size, and by this project's attention.
+"""The time that a shorter prompt saves: by a compressor of LLMLingua-2's size, and by this project's attention.
 
     python -m benchmarks.tokens               # counts the tokens
     python -m lab.benchmarks.compressors
@@ -43,7 +43,7 @@ KEPT = 0.5
 _LEVELS = 15
 _K = 5
 _CONTEXT = 8192
-# Prefill speeds, tokens a second, for which it is computed whether compression pays.
+# The prefill speeds, tokens a second, at which compression is compared with reading the whole prompt.
 SPEEDS = (50, 200, 1_000, 10_000)
 
 
@@ -52,7 +52,7 @@ class Compressors:
     """Measure compressors and the embedded LLM side by side."""
 
     tokens: Path = Path("runs/tokens.json")
-    """What `python -m benchmarks.tokens` wrote: the tokens of a prompt by its form."""
+    """The file that `python -m benchmarks.tokens` wrote: the tokens of a prompt by its form."""
     threads: int = 1
     """Threads of the embedded LLM and of the compressor."""
     encoders: Literal["real", "tiny"] = "real"
@@ -119,7 +119,7 @@ def side_by_side(scenario: Scenario, args: Compressors, console: Console) -> tup
     encoders = {size.label: Compressor(size) for size in sizes}
     window: dict[str, list[float]] = {label: [] for label in encoders}
     read_s: list[float] = []
-    # About one window: the static block, and little more.
+    # The prompt has about one window of tokens: the static block, and little more.
     static, sensors = Template(scenario).static, list(range(scenario.sensors))
     body = chat_body(None, static, "Current state: none", "grammar", sensors, scenario.max_velocity + 1)
     with LocalLLM(args.threads, _CONTEXT) as llm:

@@ -1,4 +1,4 @@
-"""The way of one `POST /decide` through the code: its files, its functions, and its changes of file.
+"""The path of one `POST /decide` through the code: its files, its functions, and its changes of file.
 
     python -m lab.benchmarks.decision_path
     python -m lab.benchmarks.decision_path --modes guided --list
@@ -12,7 +12,7 @@ packages `service` and `shared`; a coroutine that resumes is one more call. A fi
 is known by its file and qualified name; lambdas and comprehensions do not count. A change of file is a call on the
 event loop's thread in another file than the call before it; a return to a caller is none. The other threads (plan
 search, rollout evaluator) count apart, and the process that writes SQLite does not count. Learning from the outcome is
-part of the way, and so are the limits on headers, the startup gate and the client of the LLM. The number of a
+part of the path, and so are the limits on headers, the startup gate and the client of the LLM. The number of a
 coroutine's resumptions depends a little on timing, so each mode is measured several times, and the result is the
 median. It prints a table and writes JSON.
 A busy machine adds 5 changes where the store's timer begins a commit in the midst of the decision, and 2 where a
@@ -49,7 +49,7 @@ from shared.client.edge_client import EdgeClient
 from simulator.flying.local_edge import HOST, usable_port
 
 PACKAGES = ("service", "shared")
-# Writes each part of an answer to the connection.
+# The method that writes each part of an answer to the connection.
 _SEND = uvicorn_http.RequestResponseCycle.send
 # The first argument of a counting process; its mode follows.
 COUNTED = "counted"
@@ -65,7 +65,7 @@ SENSORS: dict[str, list[Any]] = {
 
 @dataclass(frozen=True)
 class DecisionPath:
-    """Count the way of one decision."""
+    """Count the calls of one decision."""
 
     modes: tuple[str, ...] = ("guided", "llm")
     """Modes of the missions."""
@@ -79,11 +79,11 @@ class DecisionPath:
 
 @dataclass
 class Calls:
-    """The calls while ``on``, as (file, function): the event loop's in order, and the other threads'."""
+    """The calls while ``recording``, as (file, function): the event loop's in order, and those of other threads."""
 
     loop: list[tuple[str, str]] = field(default_factory=list)
-    beside: list[tuple[str, str]] = field(default_factory=list)
-    on: bool = False
+    other_threads: list[tuple[str, str]] = field(default_factory=list)
+    recording: bool = False
 
     def __post_init__(self) -> None:
         self._roots = {}
@@ -93,19 +93,19 @@ class Calls:
             self._roots[package] = f"{Path(spec.submodule_search_locations[0]).resolve()}/"
         self._main = threading.main_thread().ident
 
-    def heard(self, frame: FrameType, event: str, _: object) -> None:
-        """For ``sys.setprofile``."""
-        if not self.on:
+    def on_event(self, frame: FrameType, event: str, _: object) -> None:
+        """The profile function of ``sys.setprofile``."""
+        if not self.recording:
             return
         if event == "return" and frame.f_code is _SEND.__code__:
-            # The way ends with the answer's last byte.
-            self.on = not frame.f_locals["self"].response_complete
+            # The path ends with the last byte of the answer.
+            self.recording = not frame.f_locals["self"].response_complete
         if event != "call":
             return
         name = frame.f_code.co_filename
         for package, root in self._roots.items():
             if name.startswith(root):
-                calls = self.loop if threading.get_ident() == self._main else self.beside
+                calls = self.loop if threading.get_ident() == self._main else self.other_threads
                 calls.append((f"{package}/{name.removeprefix(root)}", frame.f_code.co_qualname))
 
 
@@ -119,8 +119,8 @@ def counts(calls: Calls) -> dict[str, Any]:
         "functions": len(named),
         "calls": len(calls.loop),
         "changes of file": sum(one[0] != other[0] for one, other in zip(calls.loop, calls.loop[1:], strict=False)),
-        "files beside": len({file for file, _ in calls.beside}),
-        "functions beside": len({(file, name) for file, name in calls.beside if not name.endswith(">")}),
+        "files beside": len({file for file, _ in calls.other_threads}),
+        "functions beside": len({(file, name) for file, name in calls.other_threads if not name.endswith(">")}),
     }
 
 
@@ -142,8 +142,8 @@ def count(mode: str) -> None:
     (serve,) = entry_points(group="aicvds.commands", name="serve")
     main = serve.load()
     with answering(first) as os.environ["AICVDS_LLM_URL"]:
-        threading.setprofile(calls.heard)
-        sys.setprofile(calls.heard)
+        threading.setprofile(calls.on_event)
+        sys.setprofile(calls.on_event)
         main(["--port", str(port)])
 
 
@@ -159,13 +159,13 @@ def _ask(port: int, calls: Calls) -> None:
             body = {"decision_id": answer["decision_id"], "cost": 0.2, "failed": False}
             counted = []
             for step, outcome in ((2, None), (3, body)):
-                # The work after an answer is done.
+                # Wait until the work after the last answer has ended.
                 time.sleep(0.5)
-                calls.loop, calls.beside, calls.on = [], [], True
+                calls.loop, calls.other_threads, calls.recording = [], [], True
                 answer = _decide(client, step, 0, outcome)
-                calls.on = False
+                calls.recording = False
                 assert answer["source"] in ("llm", "guided"), answer
-                counted.append({"loop": calls.loop, "beside": calls.beside})
+                counted.append({"loop": calls.loop, "beside": calls.other_threads})
         print(json.dumps(counted), flush=True)
         code = 0
     finally:
@@ -173,13 +173,13 @@ def _ask(port: int, calls: Calls) -> None:
 
 
 def _decide(client: httpx.Client, step: int, uav: int, outcome: dict[str, Any] | None) -> dict[str, Any]:
-    heard = [None if queue is None else step for queue in SENSORS["queue"]]
+    last_seen = [None if queue is None else step for queue in SENSORS["queue"]]
     body: dict[str, Any] = {
         "step": step,
         "uav_id": uav,
         "position": [500, 450],
         "progress_m": 100.0 * step,
-        "sensors": {**SENSORS, "last_seen": heard},
+        "sensors": {**SENSORS, "last_seen": last_seen},
     }
     answer = client.post("/decide", json=body if outcome is None else {**body, "outcome": outcome})
     answer.raise_for_status()
@@ -188,16 +188,16 @@ def _decide(client: httpx.Client, step: int, uav: int, outcome: dict[str, Any] |
 
 
 def measured(mode: str, rounds: int) -> Iterator[list[Calls]]:
-    """The counts of each round, each from a process of its own."""
+    """The calls of each round, each from a process of its own."""
     for _ in range(rounds):
         command = [sys.executable, "-m", "lab.benchmarks.decision_path", COUNTED, mode]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=300)
-        told = json.loads(done.stdout)
-        yield [Calls([tuple(call) for call in one["loop"]], [tuple(call) for call in one["beside"]]) for one in told]
+        counted = json.loads(done.stdout)
+        yield [Calls([tuple(call) for call in one["loop"]], [tuple(call) for call in one["beside"]]) for one in counted]
 
 
 def show_list(calls: Calls, console: Console) -> None:
-    """The calls in order."""
+    """Print the event loop's calls in order."""
     last = ""
     for file, name in calls.loop:
         if file != last:
@@ -213,11 +213,11 @@ def main(options: DecisionPath) -> None:
     table = Table("", title="One POST /decide")
     for mode in options.modes:
         rounds = list(measured(mode, options.rounds))
-        for place, way in enumerate((mode, f"{mode}, outcome")):
+        for place, request in enumerate((mode, f"{mode}, outcome")):
             each = [counts(calls[place]) for calls in rounds]
-            found[way] = {name: statistics.median_low(one[name] for one in each) for name in each[0]}
-            found[way]["sequence"] = [f"{file}:{name}" for file, name in rounds[-1][place].loop]
-            table.add_column(way)
+            found[request] = {name: statistics.median_low(one[name] for one in each) for name in each[0]}
+            found[request]["sequence"] = [f"{file}:{name}" for file, name in rounds[-1][place].loop]
+            table.add_column(request)
             if options.show:
                 show_list(rounds[-1][place], console)
     for name in [name for name in next(iter(found.values())) if name != "sequence"]:

@@ -1,4 +1,4 @@
-"""The fewest packets that a large fleet could lose, by Lagrangian relaxation, and the planner's losses beside it.
+"""The fewest packets that a large fleet could lose, by Lagrangian relaxation, compared with the planner's losses.
 
     python -m lab.benchmarks.fleet_bound
     python -m lab.benchmarks.fleet_bound --scenario long_pipeline --worlds 3

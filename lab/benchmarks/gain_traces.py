@@ -1,4 +1,4 @@
-"""How well it decides over links with the statistics of measured ones: mode `policy`, heuristics, the learned map.
+"""The losses over links with the statistics of measured ones: mode `policy`, heuristics, the learned radio map.
 
     python -m lab.benchmarks.gain_traces --seeds 30
 
@@ -146,7 +146,7 @@ def heuristics() -> Iterator[tuple[str, Policy]]:
 
 def flown(url: str, site: Site, seed: int, scale: float) -> dict[str, int]:
     """Packets lost in one world, by scheme."""
-    # The edge would take a second flight of one mission for repeated requests.
+    # A second flight with the same mission name would look like repeated requests to the edge.
     mission_id = f"trace-{scale:g}-{seed}"
     with EdgeClient(url, timeout_s=60.0) as client:
         pilot = EdgePilot(client, mission_id, site.scenario, seed)

@@ -1,4 +1,4 @@
-"""What a planner would save that knew the channel of a shadowed world better than its beacons show.
+"""The losses of planners that know more of a shadowed world's channel than its beacons show.
 
     python -m lab.benchmarks.known_channel
     python -m lab.benchmarks.known_channel --worlds 20
@@ -39,13 +39,13 @@ from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld
 
 EARLY_STEPS = 10
-# Without any fading a second measurement at one place would leave nothing to divide by.
+# Without any fading a second measurement at one place would divide by zero.
 FADING = 0.002
 
 
 @dataclass(frozen=True)
 class Known:
-    """Fly planners that know more and more of the channel."""
+    """Fly planners with increasing knowledge of the channel."""
 
     worlds: int = 120
     """Worlds: seeds --first to --first + N - 1."""
@@ -56,7 +56,7 @@ class Known:
 
 
 class KindKnown(RadioMap):
-    """A radio map whose kind of shadowing is given; it learns the offset and the deviation.
+    """A radio map with a given kind of shadowing; it learns the offset and the deviation.
 
     Args:
         sensors: J.
@@ -72,7 +72,7 @@ class KindKnown(RadioMap):
 
 
 class OwnKnown(KindKnown):
-    """A radio map that knows each sensor's own excess loss, and learns what changes along the way.
+    """A radio map that knows each sensor's own excess loss, and learns the shadowing along the way.
 
     Args:
         own_db: shape ``(J,)``, each sensor's own excess loss, dB.
@@ -140,7 +140,7 @@ def flown(scenario: Scenario, seed: int) -> dict[str, list[int]]:
     }
 
 
-def tell(found: list[dict[str, list[int]]], console: Console) -> list[dict[str, Any]]:
+def print_rows(found: list[dict[str, list[int]]], console: Console) -> list[dict[str, Any]]:
     """Print and return each scheme's row."""
     lost = {name: [float(sum(world[name])) for world in found] for name in found[0]}
     rows: list[dict[str, Any]] = []
@@ -168,7 +168,7 @@ def main(args: Known) -> int:
     console, scenario = Console(), scenario_named("shadowed")
     seeds = range(args.first, args.first + args.worlds)
     found = [flown(scenario, seed) for seed in track(seeds, scenario.name, console=console)]
-    rows = tell(found, console)
+    rows = print_rows(found, console)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps({"seeds": list(seeds), "rows": rows}, indent=2))
     console.print(f"Wrote {args.out}")

@@ -1,4 +1,4 @@
-"""How often the links hold to which the planner gives a probability.
+"""The calibration of the planner's link probabilities: how often such links hold.
 
     python -m lab.benchmarks.link_calibration
     python -m lab.benchmarks.link_calibration --worlds 4 --scenario faulty

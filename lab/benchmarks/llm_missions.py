@@ -1,4 +1,4 @@
-"""Several missions on one embedded LLM, at the pace of the paper's world: how many decisions are the LLM's, and when?
+"""Several missions on one embedded LLM, at the pace of the paper's world: the LLM's share of the decisions.
 
     python -m lab.benchmarks.llm_missions                 # four missions of three UAVs, a step in 10 s: five minutes
     python -m lab.benchmarks.llm_missions --step-s 2.5    # closer to the LLM's limit

@@ -3,12 +3,11 @@
     python -m lab.benchmarks.notes
     python -m lab.benchmarks.notes --notes lab/benchmarks/held_out_notes.json
 
-It prints the guidance from each note, the number of right readings and of those that are wrong and without a doubt, and
-by field the orders that were found and the orders that are wrong; it writes the same as JSON. Two structures are the
-same if they order the same. A note whose `guidance` is null has no order that can be given: it is right to refuse it.
-A control works without any LLM: the most similar worked
-example's orders, with this note's numbers in place of the example's, in their order. An LLM no better than the control
-has understood nothing. The LLM is the edge's: set AICVDS_LLM_URL for another.
+It prints the guidance from each note, the number of right guidances and of wrong ones without a doubt, and by field the
+orders found and the wrong orders; it writes the same as JSON. Two guidances are the same if they give the same orders.
+A note whose `guidance` is null has no order that can be given, so the right answer is a refusal. The control uses no
+LLM: it takes the orders of the most similar worked example, with the numbers of the note in place of the example's. An
+LLM no better than the control understands nothing. The LLM is the edge's: set AICVDS_LLM_URL for another.
 """
 
 from __future__ import annotations
@@ -50,19 +49,19 @@ class Notes:
 
 
 @dataclass(frozen=True)
-class Understood:
-    """One note: its meaning, the guidance compiled from it, and the failure if there is none."""
+class CompiledNote:
+    """One note: the guidance expected, the LLM's and the control's, and the LLM's error if it gives none."""
 
     note: str
-    meant: Guidance | None
+    expected: Guidance | None
     llm: Guidance | None
     doubts: tuple[str, ...]
-    why: str
+    error: str
     control: Guidance | None
     seconds: float
 
 
-async def understood(notes: list[dict[str, object]]) -> tuple[str | None, list[Understood]]:
+async def compiled(notes: list[dict[str, object]]) -> tuple[str | None, list[CompiledNote]]:
     """The LLM's name and the guidance compiled from each note."""
     upstream = ServerPool(settings := Settings(mode="llm"), warm_up(settings))
     upstream.start()
@@ -71,17 +70,17 @@ async def understood(notes: list[dict[str, object]]) -> tuple[str | None, list[U
     found = []
     try:
         for row in notes:
-            note, begun, why = str(row["note"]), time.monotonic(), ""
+            note, begun, failure = str(row["note"]), time.monotonic(), ""
             llm: Guidance | None = None
             doubts: tuple[str, ...] = ()
             try:
                 reading = await compile_note(PhrasedNote(note, SCENARIOS["paper"], ()), SCENARIOS["paper"], upstream)
                 llm, doubts = reading.guidance, reading.doubts
             except (BadOrders, Impossible, NoDecision, TimeoutError) as error:
-                why = str(error) or "late"
+                failure = str(error) or "late"
             took = time.monotonic() - begun
-            meant = None if row["guidance"] is None else Guidance.model_validate(row["guidance"])
-            found.append(Understood(note, meant, llm, doubts, why, control(note), took))
+            expected = None if row["guidance"] is None else Guidance.model_validate(row["guidance"])
+            found.append(CompiledNote(note, expected, llm, doubts, failure, control(note), took))
     finally:
         await upstream.close()
     return upstream.notes_model, found
@@ -90,12 +89,12 @@ async def understood(notes: list[dict[str, object]]) -> tuple[str | None, list[U
 def control(note: str) -> Guidance | None:
     """The most similar example's orders with this note's numbers; None if the numbers do not fit."""
     example, orders = similar_examples(note, 1)[0]
-    theirs, ours = numbers(example), numbers(note)
-    if len(theirs) != len(ours):
+    old, new = numbers(example), numbers(note)
+    if len(old) != len(new):
         return None
-    names = dict(zip(map(str, theirs), map(str, ours), strict=True))
+    names = dict(zip(map(str, old), map(str, new), strict=True))
     try:
-        return parse_orders(re.sub(r"[0-9]+", lambda found: names.get(found[0], found[0]), orders), note)
+        return parse_orders(re.sub(r"[0-9]+", lambda match: names.get(match[0], match[0]), orders), note)
     except (BadOrders, Impossible):
         return None
 
@@ -106,63 +105,63 @@ def numbers(text: str) -> list[int]:
     return [number for number in named if number is not None]
 
 
-def same(given: Guidance | None, meant: Guidance | None) -> bool:
-    """Whether both order the same; a note without an order that can be given is refused, or nothing is ordered."""
-    if given is None or meant is None:
-        return meant is None and not given
+def same(given: Guidance | None, expected: Guidance | None) -> bool:
+    """Whether both give the same orders; for an ``expected`` of None, whether none are given."""
+    if given is None or expected is None:
+        return expected is None and not given
     levels, most = (
         SCENARIOS["paper"].max_velocity + 1,
-        1 + max((w.sensor_id for w in given.sensors + meant.sensors), default=0),
+        1 + max((w.sensor_id for w in given.sensors + expected.sensors), default=0),
     )
     return (
-        np.array_equal(given.allowed(levels), meant.allowed(levels))
-        and np.array_equal(given.weights(most), meant.weights(most))
-        and np.array_equal(given.visit_intervals(most), meant.visit_intervals(most))
+        np.array_equal(given.allowed(levels), expected.allowed(levels))
+        and np.array_equal(given.weights(most), expected.weights(most))
+        and np.array_equal(given.visit_intervals(most), expected.visit_intervals(most))
     )
 
 
 def facts(guidance: Guidance | None) -> set[tuple[str, int, float]]:
-    """A structure's orders: field, sensor (-1: none), value."""
+    """The orders of a guidance: field, sensor (-1: none), value."""
     if guidance is None:
         return set()
-    asked = {("visit_every", w.sensor_id, float(w.visit_every)) for w in guidance.sensors if w.visit_every is not None}
-    asked |= {("weight", w.sensor_id, w.weight) for w in guidance.sensors if w.weight != 1.0}
-    asked |= {("forbidden_velocities", -1, float(level)) for level in guidance.forbidden_velocities}
+    orders = {("visit_every", w.sensor_id, float(w.visit_every)) for w in guidance.sensors if w.visit_every is not None}
+    orders |= {("weight", w.sensor_id, w.weight) for w in guidance.sensors if w.weight != 1.0}
+    orders |= {("forbidden_velocities", -1, float(level)) for level in guidance.forbidden_velocities}
     limits = {"min_velocity": guidance.min_velocity, "max_velocity": guidance.max_velocity}
-    return asked | {(name, -1, float(level)) for name, level in limits.items() if level is not None}
+    return orders | {(name, -1, float(level)) for name, level in limits.items() if level is not None}
 
 
-def main(asked: Notes) -> None:
+def main(options: Notes) -> None:
     """Run, print, write."""
     console = Console()
-    model, rows = asyncio.run(understood(json.loads(asked.notes.read_text())))
-    told = Table("", "note", "understood", title=str(model))
+    model, rows = asyncio.run(compiled(json.loads(options.notes.read_text())))
+    table = Table("", "note", "understood", title=str(model))
     for row in rows:
-        said = f"({row.why})" if row.llm is None else " ".join((row.llm.in_words(), *row.doubts))
-        told.add_row("right" if same(row.llm, row.meant) else "", row.note, said)
-    console.print(told)
+        text = f"({row.error})" if row.llm is None else " ".join((row.llm.in_words(), *row.doubts))
+        table.add_row("right" if same(row.llm, row.expected) else "", row.note, text)
+    console.print(table)
     result: dict[str, object] = {"model": model, "notes": len(rows)}
-    for who in ("llm", "control"):
-        given = [getattr(row, who) for row in rows]
-        exact = sum(same(one, row.meant) for one, row in zip(given, rows, strict=True))
-        silent = sum(one is None and row.meant is not None for one, row in zip(given, rows, strict=True))
-        result[who] = {"exact": exact, "nothing": silent, "wrong": len(rows) - exact - silent}
-        console.print(f"{who}: {exact} of {len(rows)} right, {silent} refused, {len(rows) - exact - silent} wrong")
-        answers = [(facts(row.meant), one) for one, row in zip(given, rows, strict=True)]
+    for reader in ("llm", "control"):
+        given = [getattr(row, reader) for row in rows]
+        exact = sum(same(one, row.expected) for one, row in zip(given, rows, strict=True))
+        silent = sum(one is None and row.expected is not None for one, row in zip(given, rows, strict=True))
+        result[reader] = {"exact": exact, "nothing": silent, "wrong": len(rows) - exact - silent}
+        console.print(f"{reader}: {exact} of {len(rows)} right, {silent} refused, {len(rows) - exact - silent} wrong")
+        answers = [(facts(row.expected), one) for one, row in zip(given, rows, strict=True)]
         for name in FIELDS:
             pairs = [({f for f in m if f[0] == name}, {f for f in facts(g) if f[0] == name}) for m, g in answers]
-            wanted, told_of = (sum(len(pair[i]) for pair in pairs) for i in (0, 1))
-            both = sum(len(meant & said) for meant, said in pairs)
-            result[f"{who}_{name}"] = {"asked": wanted, "found": both, "said": told_of}
-            console.print(f"  {name}: {both} of {wanted} found, {told_of - both} of {told_of} wrong")
+            expected, answered = (sum(len(pair[i]) for pair in pairs) for i in (0, 1))
+            both = sum(len(own & other) for own, other in pairs)
+            result[f"{reader}_{name}"] = {"asked": expected, "found": both, "said": answered}
+            console.print(f"  {name}: {both} of {expected} found, {answered - both} of {answered} wrong")
     certain = [row for row in rows if row.llm and not row.doubts]
-    wrong = sum(not same(row.llm, row.meant) for row in certain)
+    wrong = sum(not same(row.llm, row.expected) for row in certain)
     result |= {"certain": len(certain), "wrong_and_certain": wrong}
     console.print(f"{len(certain)} with orders and without a doubt, of which {wrong} wrong")
     result["seconds_mean"] = round(sum(row.seconds for row in rows) / len(rows), 2)
-    asked.out.parent.mkdir(parents=True, exist_ok=True)
-    asked.out.write_text(json.dumps(result, indent=1) + "\n")
-    console.print(f"{result['seconds_mean']} s a note; wrote {asked.out}", highlight=False)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    console.print(f"{result['seconds_mean']} s a note; wrote {options.out}", highlight=False)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What an outage of the edge costs, by the velocity at which the UAVs fly on while it lasts.
+"""The losses of an outage of the edge, by the velocity of the UAVs during the outage.
 
     python -m lab.benchmarks.outage
 
@@ -70,13 +70,13 @@ ON_BOARD = {"7 m/s": Constant, "in place": InPlace, "last decided": OnBoard}
 
 
 class CutOffClient(EdgeClient):
-    """An edge's client that reaches nobody from the steps ``gone`` on."""
+    """A client that does not reach the edge in the steps ``outage``."""
 
-    gone = range(0)
+    outage = range(0)
 
     def decide(self, request: DecideRequest, attempts: int | None = None) -> Exchange:
-        """Ask, outside the outage."""
-        if request.step in self.gone:
+        """Request a decision; raises ``EdgeUnreachable`` during the outage."""
+        if request.step in self.outage:
             raise EdgeUnreachable("the outage of this benchmark")
         return super().decide(request, attempts)
 
@@ -88,7 +88,7 @@ def flown(url: str, scenario: Scenario, seed: int, variant: str, outage: int) ->
         pilot = EdgePilot(client, name, scenario, seed, mode="policy", deadline_ms=30_000)
         client.put_mission(name, pilot.spec)
         if variant != "none":
-            client.gone = range(scenario.steps // 2 - 1, scenario.steps // 2 - 1 + outage)
+            client.outage = range(scenario.steps // 2 - 1, scenario.steps // 2 - 1 + outage)
             pilot.on_board = ON_BOARD[variant](scenario, seed)
         tally = fly(Site(scenario), pilot, seed).tally
         client.delete_mission(name)

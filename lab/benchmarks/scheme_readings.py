@@ -1,4 +1,4 @@
-"""What EOF and WQCS lose on scenario `paper` under the readings that the paper's text allows.
+"""The losses of EOF and WQCS on scenario `paper` under the readings that the paper's text allows.
 
     python -m lab.benchmarks.scheme_readings
     python -m lab.benchmarks.scheme_readings --seeds 3

@@ -1,4 +1,4 @@
-"""What it costs that UAVs observe only the sensor that they serve, as in the paper's protocol.
+"""The losses of UAVs that observe only the sensor that they serve, as in the paper's protocol.
 
     python -m lab.benchmarks.served_only
 

@@ -1,4 +1,4 @@
-"""Whether trust finds a good LLM within one mission: no planner, and an LLM that answers as the planner would.
+"""The growth of trust in a good LLM within one mission: no planner, and an LLM that answers as the planner would.
 
     python -m lab.benchmarks.trust --seeds 30
 
@@ -67,13 +67,13 @@ class Echo:
         self.answer: tuple[int, int] = (0, 0)
 
     async def ask(self, mission: Mission, offer: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
-        """Nearly all probability for the answer's sensor at the nearest velocity, or else for the first letter."""
+        """Advise the answer's sensor at the nearest velocity, or else the first letter, with nearly all probability."""
         sensor, velocity = self.answer
         letters = list(offer.labels)
-        there = [letter for letter in letters if offer.actions[offer.labels[letter]][0] == sensor] or letters[:1]
-        said = min(there, key=lambda letter: abs(offer.actions[offer.labels[letter]][1] - velocity))
-        told = {letter: _DOUBT / len(letters) + (1.0 - _DOUBT) * (letter == said) for letter in letters}
-        return LlmAdvice(prompt, offer.by_action(told), None, None, calibrated=False, model=None)
+        of_sensor = [letter for letter in letters if offer.actions[offer.labels[letter]][0] == sensor] or letters[:1]
+        nearest = min(of_sensor, key=lambda letter: abs(offer.actions[offer.labels[letter]][1] - velocity))
+        probabilities = {letter: _DOUBT / len(letters) + (1.0 - _DOUBT) * (letter == nearest) for letter in letters}
+        return LlmAdvice(prompt, offer.by_action(probabilities), None, None, calibrated=False, model=None)
 
 
 class Pilot(EdgePilot):
@@ -133,7 +133,7 @@ def main(args: Trusted) -> int:
     trust: list[list[float]] = []
     with edge() as (url, engine):
         echo = Echo()
-        # It replaces the method that asks an LLM about one UAV.
+        # The stand-in replaces the method that queries an LLM about one UAV.
         setattr(engine.queries, "ask", echo.ask)  # noqa: B010
         for seed in track(seeds, "Flying", console=console):
             lost["planner"].append(flown(url, site, seed, echo, "policy")[0])

@@ -19,12 +19,12 @@ from shared.kit.cores import usable_cores
 _WARM_UP_STEPS = 30
 _MOST_GRADIENT = 1.0
 CHECKPOINT_STEPS = 25
-# Steps whose mean loss is shown; a log has a line as often.
+# Steps of the mean loss in the progress display, and from one log line to the next.
 _RECENT = 50
 
 
 class TrainingExample(Protocol):
-    """What is trained on: a text that the student reads, with what it is to answer."""
+    """A training example: the text that the student reads, and the expected answer."""
 
     @property
     def text(self) -> str:
@@ -37,7 +37,7 @@ Read = TypeVar("Read", bound=TrainingExample, contravariant=True)
 
 
 class AdapterStudent(Protocol[Read]):
-    """A student of some kind of example."""
+    """A student that learns from one kind of example."""
 
     model: Any
 
@@ -49,7 +49,7 @@ class AdapterStudent(Protocol[Read]):
 def train(
     student: AdapterStudent[E], examples: Sequence[E], args: TrainingOptions, checkpoint: Path
 ) -> Generator[float, None, None]:
-    """Train, and yield each step's loss; goes on from the checkpoint, which is written every 25 steps.
+    """Train, and yield each step's loss; resumes from the checkpoint, which it writes every 25 steps.
 
     Raises:
         ValueError: the checkpoint is of another run.
@@ -106,16 +106,16 @@ def train_showing(
         left = args.steps
         for loss in train(student, training, args, args.out / "checkpoint.pt"):
             recent = [*recent[1 - _RECENT :], loss]
-            said = f"Training, loss {sum(recent) / len(recent):.3f}"
-            progress.update(task, advance=1, description=said)
+            status = f"Training, loss {sum(recent) / len(recent):.3f}"
+            progress.update(task, advance=1, description=status)
             left -= 1
             if left % _RECENT == 0 and not console.is_terminal:
-                console.print(f"{args.steps - left} steps: {said}", highlight=False)
+                console.print(f"{args.steps - left} steps: {status}", highlight=False)
         progress.update(task, advance=left)
 
 
 def _run(examples: Sequence[TrainingExample], args: TrainingOptions) -> str:
-    """What determines a run's weights, as text."""
+    """A text of all inputs that determine the weights of a run."""
     texts = hashlib.sha256("\n".join(example.text for example in examples).encode()).hexdigest()
     return f"{texts} {args.begin} {args.steps} {args.batch} {args.rank} {args.learning_rate} {args.seed}"
 

@@ -42,7 +42,7 @@ class DecisionStudent(Student):
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """How a student decides beside the teacher, over held-out decisions.
+    """The agreement of a student with the teacher, over held-out decisions.
 
     Attributes:
         sensor: share of decisions whose likeliest letter is of the teacher's sensor, where that is shown.

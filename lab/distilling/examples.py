@@ -1,9 +1,9 @@
 """Examples for the adapter: the compact prompts of recorded flights, with a teacher's preference for every label.
 
-A mission is seen in one of several views: with what the fleet has learned of its links, or with each UAV's own reports
-and the formula's links; and with no, few or many experiences. The teacher knows what the fleet has learned in all of
-them. Where it has nothing to collect it names any sensor, also one that fails again and again. So the target shuns the
-sensors that have failed by the experiences in the prompt.
+A mission is shown in one of several views: with the links that the fleet has learned, or with each UAV's own reports
+and the formula's links; and with no, few or many experiences. The teacher knows the learned links in all of them. Where
+no sensor has anything to collect, it names any sensor, even one that fails repeatedly. So the target gives little
+probability to sensors whose newest experience in the prompt is a failure.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ _AFTER_FAILURE = 0.15
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What a prompt shows of a fleet's past: its learned ``belief`` or only reports, and so many ``experiences``."""
+    """The part of a fleet's past that a prompt shows: the learned ``belief`` or only reports, and the experiences."""
 
     belief: Belief
     experiences: int
 
 
 LEARNED, UNLEARNED, EXPERIENCED = View("fleet", 0), View("reported", 0), View("reported", 8)
-# The views of a file's missions, one after the other. Most are of a learned belief, as missions are by default.
+# The views of a file's missions, in turn. Most have a learned belief, as missions have by default.
 _CYCLE = (
     LEARNED,
     EXPERIENCED,
@@ -72,8 +72,8 @@ class PromptExample:
 
     Attributes:
         sensors: the sensor of each label.
-        reference: the label of the teacher's action, or of the likeliest where it is shunned; -1 where no row has the
-            teacher's sensor.
+        reference: the label of the teacher's action, or of the likeliest action where the teacher's sensor has failed;
+            -1 where no row has the teacher's sensor.
     """
 
     text: str
@@ -145,7 +145,7 @@ def _example(state: AttendedState, reference: Reference) -> PromptExample:
 
 
 def _with_other_signs(text: str, seed: Sequence[int]) -> str:
-    """The text with its sensors' signs drawn anew: scenarios' IDs begin at 0, and every sign is to be learned."""
+    """The text with new random signs of its sensors: IDs of scenarios begin at 0, but every sign must be learned."""
     drawn = "".join(np.random.default_rng(seed).permutation(list(SIGNS)))
     return text.translate(str.maketrans(SIGNS, drawn))
 
@@ -153,7 +153,7 @@ def _with_other_signs(text: str, seed: Sequence[int]) -> str:
 def _target(lost: FloatArray, actions: Sequence[Action], index: np.ndarray, chosen: int) -> FloatArray:
     """Soft targets by regret, and a share for the reference's sensor; labels of the same action share alike.
 
-    Of actions that lose the same, the faster one is to be learned, as :func:`lab.adapter.batches.targets_of` says.
+    Of actions with equal losses the student learns the faster one, as :func:`lab.adapter.batches.targets_of` says.
     """
     sensors, velocities = np.array(actions)[index].T
     worth = lost[index] - _WORTH_OF_VELOCITY * velocities

@@ -26,7 +26,7 @@ from lab.exploration.rollouts import Header, RolloutStep, read_rollouts
 from service.llm.adapter_version import PROMPT_VERSION
 from service.llm.model_file import sha256
 
-# Every so many missions of a file, one is held out, and seen in each of these views.
+# One of so many missions of a file is held out, and shown in each of these views.
 HELD_OUT = 11
 _HELD_OUT_VIEWS = {"": LEARNED, " unlearned": UNLEARNED, " unlearned, experienced": EXPERIENCED}
 

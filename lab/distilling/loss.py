@@ -1,4 +1,4 @@
-"""What an adapter is trained for: the answer's letter, its sensor, and at each row's letter what the row is worth.
+"""The training loss of an adapter: the answer's letter, its sensor, and the worth of a row at its letter.
 
 The teacher's probabilities of the letters alone are learned slowly, since one token has to compare five rows. So each
 row's last token, its letter, is trained too: the model says there whether the row is the best one and which of its

@@ -28,7 +28,7 @@ _TYPO_SHARE = 0.08
 
 @dataclass(frozen=True, slots=True)
 class NoteExample:
-    """A note in words, as the adapter reads it, and its orders in the adapter's language."""
+    """A note, its text for the adapter with letters for numbers, and its orders in the adapter's language."""
 
     note: str
     text: str
@@ -49,7 +49,7 @@ def _tables(name: str) -> dict[str, Any]:
 
 
 def phrasings(kind: str, held_out: bool) -> Sequence[str]:
-    """A kind's phrasings: every seventh is held out."""
+    """The phrasings of a kind: the held-out ones, every seventh, or the others."""
     return [
         text
         for number, text in enumerate(_tables("phrasings.toml")[kind]["phrasings"])
@@ -59,14 +59,14 @@ def phrasings(kind: str, held_out: bool) -> Sequence[str]:
 
 def operators(held_out: bool) -> Sequence[Mapping[str, Any]]:
     """The operators that are held out, or the others."""
-    return [own for own in _tables("operators.toml").values() if own.get("held_out", False) == held_out]
+    return [operator for operator in _tables("operators.toml").values() if operator.get("held_out", False) == held_out]
 
 
 def note_examples(seed: int, held_out: bool = False) -> Iterator[NoteExample]:
-    """Notes without end.
+    """An endless sequence of notes.
 
     Args:
-        held_out: of phrasings and operators that training never has.
+        held_out: whether the notes have the phrasings and operators that training never uses.
     """
     random = Random(f"{seed} {held_out}")
     while True:
@@ -74,7 +74,7 @@ def note_examples(seed: int, held_out: bool = False) -> Iterator[NoteExample]:
 
 
 class _Note:
-    """One note in the making."""
+    """The writer of one note."""
 
     def __init__(self, random: Random, held_out: bool) -> None:
         self._random = random
@@ -83,7 +83,7 @@ class _Note:
         self._fields = Fields(random, self._operator)
 
     def example(self) -> NoteExample:
-        """Write the note, and replace its numbers by letters."""
+        """The note, its text with letters for numbers, and its orders."""
         clauses = self._clauses()
         pieces = self._joined(clauses)
         if self._random.random() < _TYPO_SHARE:
@@ -98,7 +98,7 @@ class _Note:
             place += len(piece.text)
         orders = [clause.orders for clause in clauses if clause.orders != "nothing"]
         kept = [order for order in orders if order != "unclear"]
-        # What is unclear is said once, at the end.
+        # The order `unclear` comes once, at the end.
         answer = "; ".join(kept + ["unclear"] * (len(kept) < len(orders))) or "nothing"
         return NoteExample(note, lettered.text, answer.format_map(letters))
 
@@ -111,7 +111,7 @@ class _Note:
             if self._random.random() < 0.4:
                 clauses.insert(self._random.randrange(2), self._order())
         elif draw < 0.36:
-            clauses = self._about_it()
+            clauses = self._about_pronoun()
         else:
             clauses = [self._order() for _ in range(self._random.choice((1, 1, 1, 1, 2, 2, 2, 3)))]
             if len(clauses) == 1 and self._random.random() < 0.1 and not clauses[0].orders.startswith(("m", "a")):
@@ -129,11 +129,11 @@ class _Note:
         reason = self._random.choice(self._operator["reasons"])
         return Clause((*clause.pieces, Piece(self._chosen(reason))), clause.orders)
 
-    def _about_it(self) -> list[Clause]:
+    def _about_pronoun(self) -> list[Clause]:
         """An opening that names a sensor, and one or two orders about it."""
         lead = self._filled(self._chosen(self._random.choice(self._operator["leads"])))
         key = self._fields.last_sensors
-        self._fields.it = key
+        self._fields.pronoun = key
         kinds = self._random.choice(
             (["visit_of_it"], ["visit_of_it"], ["weight_of_it"], ["visit_of_it", "weight_of_it"])
         )
@@ -181,7 +181,7 @@ class _Note:
         return tuple(Piece(piece.text.lower(), piece.key) for piece in pieces)
 
     def _with_typo(self, pieces: Pieces) -> Pieces:
-        """Two neighbouring letters of one word change places, outside numbers."""
+        """Swap two neighbouring letters of one word outside numbers."""
         long = [
             (number, found.start())
             for number, piece in enumerate(pieces)

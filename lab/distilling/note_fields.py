@@ -30,13 +30,13 @@ Pieces = tuple[Piece, ...]
 
 
 class Fields:
-    """Writes a note's fields, and remembers what they name.
+    """Writes the fields of a note, and keeps their forms in the orders, which have the keys of numbers in braces.
 
     Attributes:
-        keys: what the last field of each name is in the orders: the numbers' keys in braces.
+        keys: by field name, the form of its last field in the orders.
         plural: whether the last sensors are several.
-        last_sensors: the last sensors, as in the orders.
-        it: what "it" names.
+        last_sensors: the form of the last sensors in the orders.
+        pronoun: the form of the sensor that "it" refers to.
     """
 
     def __init__(self, random: Random, operator: Mapping[str, Any]) -> None:
@@ -46,13 +46,15 @@ class Fields:
         self._count = 0
         self.keys: dict[str, str] = {}
         self.plural = False
-        self.last_sensors = self.it = ""
+        self.last_sensors = self.pronoun = ""
 
     def write(self, name: str, before: str) -> Pieces:
-        """The pieces of a field behind a text."""
+        """The pieces of a field that follows the text ``before``."""
         kind, second = name[0], name.endswith("2")
-        pieces, said = getattr(self, f"_{_WRITERS[kind]}")(before)
-        self.keys[("N" if kind == "O" else "W" if kind in "KD" else "V" if kind == "v" else kind) + "2" * second] = said
+        pieces, orders = getattr(self, f"_{_WRITERS[kind]}")(before)
+        self.keys[("N" if kind == "O" else "W" if kind in "KD" else "V" if kind == "v" else kind) + "2" * second] = (
+            orders
+        )
         return tuple(pieces)
 
     def _number(self, text: str) -> tuple[Piece, str]:
@@ -60,7 +62,7 @@ class Fields:
         return Piece(text, f"k{self._count}"), f"{{k{self._count}}}"
 
     def _written(self, value: int, before: str, words: float = 0.25) -> str:
-        """A number in digits or as a word; never a word that touches the text before it."""
+        """A number in digits or as a word; always in digits directly after a letter or digit."""
         in_words = value < _MOST_IN_WORDS and not before[-1:].isalnum() and self._random.random() < words
         return CARDINALS[value] if in_words else str(value)
 
@@ -74,15 +76,18 @@ class Fields:
         draw = self._random.random()
         self.plural = draw > 0.8
         if draw > 0.96:
-            pieces, said = [Piece(self._random.choice(("all sensors", "all of the sensors", "all the sensors")))], "all"
+            pieces, orders = (
+                [Piece(self._random.choice(("all sensors", "all of the sensors", "all the sensors")))],
+                "all",
+            )
         elif draw > 0.8:
-            pieces, said = self._list()
+            pieces, orders = self._list()
         else:
             head, _, tail = self._random.choice(self._operator["sensors"]).partition("{n}")
-            number, said = self._number(self._written(self._sensor_id(), head, 0.1))
+            number, orders = self._number(self._written(self._sensor_id(), head, 0.1))
             pieces = [Piece(head), number, Piece(tail)]
-        self.last_sensors = said
-        return pieces, said
+        self.last_sensors = orders
+        return pieces, orders
 
     def _list(self) -> tuple[list[Piece], str]:
         head, _, tail = self._random.choice(self._operator["plural"]).partition("{list}")
@@ -93,17 +98,17 @@ class Fields:
             return [Piece(head), one, Piece(dash), two, Piece(tail)], f"{a}-{b}"
         ids = [self._sensor_id() for _ in range(self._random.choice((2, 2, 2, 3, 3, 4)))]
         last = self._random.choice((" and ", " and ", " & ", ", ", ", and "))
-        pieces, said = [Piece(head)], []
+        pieces, keys = [Piece(head)], []
         for place, sensor in enumerate(ids):
             if place:
                 pieces.append(Piece(last if place == len(ids) - 1 else ", "))
             number, key = self._number(str(sensor))
             pieces.append(number)
-            said.append(key)
-        return [*pieces, Piece(tail)], " ".join(said)
+            keys.append(key)
+        return [*pieces, Piece(tail)], " ".join(keys)
 
     def _it(self, _: str) -> tuple[list[Piece], str]:
-        return [Piece("it")], self.it
+        return [Piece("it")], self.pronoun
 
     def _period(self, before: str) -> tuple[list[Piece], str]:
         if self._random.random() < 0.12:
@@ -111,8 +116,8 @@ class Fields:
             value = self._random.randrange(least, most)
         else:
             unit, value = self._random.choice(_STEPS), self._random.choice((*range(2, 13), *range(2, 10), 15, 20))
-        number, said = self._number(self._written(value, before))
-        return [number, Piece(f" {unit}")], said
+        number, orders = self._number(self._written(value, before))
+        return [number, Piece(f" {unit}")], orders
 
     def _ordinal(self, before: str) -> tuple[list[Piece], str]:
         value = self._random.choice((2, 2, 3, 3, 4, 5, 6, 7, 8, 9, 10, 12))
@@ -121,50 +126,50 @@ class Fields:
             text = self._random.choice(("other", "other", "alternate"))
         elif self._random.random() < 0.35:
             text = f"{value}{ {2: 'nd', 3: 'rd'}.get(value, 'th') }"
-        number, said = self._number(text)
-        return [number, Piece(self._random.choice((" step", " step", " step", " time step", " round")))], said
+        number, orders = self._number(text)
+        return [number, Piece(self._random.choice((" step", " step", " step", " time step", " round")))], orders
 
     def _weight(self, before: str) -> tuple[list[Piece], str]:
         value = self._random.choice((2, 3, 4, 5, 6, 7, 8, 9, 10, 2, 3, 4, 5))
         text = (
             self._random.choice(("1.5", "2.5", "0.5")) if self._random.random() < 0.06 else self._written(value, before)
         )
-        number, said = self._number(text)
-        return [number], said
+        number, orders = self._number(text)
+        return [number], orders
 
     def _factor(self, before: str) -> tuple[list[Piece], str]:
         draw = self._random.random()
         if draw < 0.2 and not before[-1:].isalnum():
-            number, said = self._number("twice")
-            return [number], said
+            number, orders = self._number("twice")
+            return [number], orders
         if draw < 0.3:
-            number, said = self._number(str(self._random.randrange(2, 11)))
-            return [number, Piece("x")], said
-        pieces, said = self._weight(before)
-        return [*pieces, Piece(" times")], said
+            number, orders = self._number(str(self._random.randrange(2, 11)))
+            return [number, Piece("x")], orders
+        pieces, orders = self._weight(before)
+        return [*pieces, Piece(" times")], orders
 
     def _double(self, _: str) -> tuple[list[Piece], str]:
-        number, said = self._number(self._random.choice(("double", "double", "triple", "half")))
-        return [number], said
+        number, orders = self._number(self._random.choice(("double", "double", "triple", "half")))
+        return [number], orders
 
     def _velocity(self, before: str) -> tuple[list[Piece], str]:
-        pieces, said = self._bare_velocity(before)
+        pieces, orders = self._bare_velocity(before)
         draw = self._random.random()
         if draw < 0.1:
             unit, least, most = self._random.choice(_OTHER_SPEEDS)
             pieces = [Piece(str(self._random.randrange(least, most)), pieces[0].key)]
-            return [*pieces, Piece(self._random.choice((" ", " ", "")) + unit)], said
+            return [*pieces, Piece(self._random.choice((" ", " ", "")) + unit)], orders
         if draw < 0.9:
-            return [*pieces, Piece(f" {self._random.choice(_METRES)}")], said
-        return (pieces, said)
+            return [*pieces, Piece(f" {self._random.choice(_METRES)}")], orders
+        return (pieces, orders)
 
     def _bare_velocity(self, before: str) -> tuple[list[Piece], str]:
-        number, said = self._number(self._written(self._random.randrange(1, 15), before, 0.12))
-        return [number], said
+        number, orders = self._number(self._written(self._random.randrange(1, 15), before, 0.12))
+        return [number], orders
 
     def _step(self, _: str) -> tuple[list[Piece], str]:
-        number, said = self._number(str(self._random.randrange(5, 200)))
-        return [number], said
+        number, orders = self._number(str(self._random.randrange(5, 200)))
+        return [number], orders
 
 
 _WRITERS = {

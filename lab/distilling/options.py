@@ -12,7 +12,7 @@ from tyro.conf import arg
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingOptions:
-    """What both trainings have."""
+    """The options of both trainings."""
 
     out: Annotated[Path, arg(metavar="FOLDER")]
     """Folder of the examples, the checkpoint and the adapter."""
@@ -54,7 +54,7 @@ class Distill(TrainingOptions):
     """
 
     rollouts: Annotated[tyro.conf.Positional[tuple[Path, ...]], arg(metavar="FILE")]
-    """What `python -m lab explore` wrote, with a teacher."""
+    """Files that `python -m lab explore` wrote, with a teacher."""
     workers: int = 1
     """Processes that make the examples."""
     ray: Annotated[str | None, arg(metavar="local|HOST:PORT", help_behavior_hint="")] = None

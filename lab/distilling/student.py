@@ -36,7 +36,7 @@ class Student:
     """
 
     def __init__(self, gguf: Path, static: str, rank: int, device: str, begin: Path | None = None) -> None:
-        # To load the model takes longer than to find out that this file is none.
+        # Loading the model takes longer than the check of this file.
         earlier = None if begin is None or begin.is_dir() else GgufAdapter.read(begin)
         # Their imports take seconds.
         from peft import LoraConfig, PeftModel, get_peft_model, set_peft_model_state_dict
@@ -100,7 +100,7 @@ class Student:
 
     @torch.no_grad()
     def _read_before(self, prefix: Sequence[int], lists: int) -> Any:
-        """What the attention keeps of a prefix, for so many lists of tokens."""
+        """The attention's cache of a prefix, for ``lists`` lists of tokens."""
         read = self.model.base_model.model.model(torch.tensor([list(prefix)], device=self.device), use_cache=True)
         read.past_key_values.batch_repeat_interleave(lists)
         return read.past_key_values

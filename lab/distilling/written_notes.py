@@ -23,16 +23,16 @@ from shared.planning.orders import NO_GUIDANCE, Guidance
 from shared.world.scenario import SCENARIOS
 
 _PAPER = SCENARIOS["paper"]
-# Beyond so many choices of letters a note is left out.
+# A note with more combinations of letters is left out.
 _MOST_CHOICES = 20_000
 _ALL = re.compile(r"\b(?:all|every(?!one|body)|each|whole|any)\b")
 
 
 class WrittenNotes:
-    """The notes of some files whose orders the adapter's language can express.
+    """The notes of some files, as far as the adapter's language can express their orders.
 
     Attributes:
-        left_out: those that it cannot.
+        left_out: the notes whose orders it cannot express.
     """
 
     def __init__(self, files: Sequence[Path]) -> None:
@@ -45,7 +45,7 @@ class WrittenNotes:
                 except ValueError:
                     self.left_out.append(row["note"])
                     continue
-                # The adapter reads what the edge's phrases leave of a note.
+                # The adapter gets the rest of a note, without the phrases that the edge reads.
                 phrased = PhrasedNote(row["note"], _PAPER, {})
                 if phrased.orders or phrased.is_read or orders_of(phrased.text, guidance, 0) is None:
                     self.left_out.append(row["note"])
@@ -56,7 +56,7 @@ class WrittenNotes:
         return len(self._notes)
 
     def examples(self, seed: int) -> Iterator[NoteExample]:
-        """Notes without end, all of them before one comes again, each time with other letters."""
+        """An endless sequence of passes over all notes in random order, each note with other letters each time."""
         random = Random(f"written {seed}")
         while self._notes:
             for note, guidance in random.sample(self._notes, len(self._notes)):
@@ -80,16 +80,16 @@ def orders_of(note: str, guidance: Guidance, seed: int) -> NoteExample | None:
     at = {letter: number.begin for letter, number in lettered.numbers.items()}
     best: tuple[float, list[str]] | None = None
     for chosen in product(*choices):
-        # A number is of one order, but for the sensors of two, and the only velocity that is allowed.
+        # A number is in one order, except for sensors in two orders and for a velocity that is both min and max.
         kinds = [(letter, kind) for order in chosen for letter, kind in _used(order)]
         letters = [letter for letter, kind in kinds if kind not in ("sensor", "max")]
         letters += {letter for letter, kind in kinds if kind == "max"} - {one for one, kind in kinds if kind == "min"}
         others = {letter for letter, kind in kinds if kind == "sensor"}
         if len(set(letters)) < len(letters) or others & set(letters):
             continue
-        apart = float(sum(_apart([at[letter] for letter, _ in _used(order)]) for order in chosen))
-        if best is None or apart < best[0]:
-            best = apart, sorted(chosen, key=lambda order: min((at[one] for one, _ in _used(order)), default=0))
+        span = float(sum(_span([at[letter] for letter, _ in _used(order)]) for order in chosen))
+        if best is None or span < best[0]:
+            best = span, sorted(chosen, key=lambda order: min((at[one] for one, _ in _used(order)), default=0))
     if best is None:
         return None
     answer = SEPARATOR.join(best[1]) or NOTHING
@@ -104,16 +104,16 @@ def orders_of(note: str, guidance: Guidance, seed: int) -> NoteExample | None:
     )
 
 
-def _apart(places: Sequence[int]) -> int:
+def _span(places: Sequence[int]) -> int:
     return max(places, default=0) - min(places, default=0)
 
 
 def _used(order: str) -> list[tuple[str, str]]:
     """The letters of an order, and whether each is a sensor's."""
-    kind, *words = order.replace("-", " ").split()
-    sensors = {"visit": len(words) if words[-1:] == ["always"] else len(words) - 2, "weigh": len(words) - 1}
-    count = sensors.get(kind, len(words) if kind == "ignore" else 0)
-    return [(word, "sensor" if place < count else kind) for place, word in enumerate(words) if len(word) == 1]
+    kind, *terms = order.replace("-", " ").split()
+    sensors = {"visit": len(terms) if terms[-1:] == ["always"] else len(terms) - 2, "weigh": len(terms) - 1}
+    count = sensors.get(kind, len(terms) if kind == "ignore" else 0)
+    return [(term, "sensor" if place < count else kind) for place, term in enumerate(terms) if len(term) == 1]
 
 
 def _choices(lettered: LetteredNote, guidance: Guidance, lowered: str) -> Iterator[list[str]]:
@@ -128,24 +128,28 @@ def _choices(lettered: LetteredNote, guidance: Guidance, lowered: str) -> Iterat
     for every, sensors in values["visit_every"].items():
         periods = [letter for letter in lettered.numbers if _means(lettered, f"visit {ALL} every {letter}", every)]
         ends = [f" every {letter}" for letter in periods] + [" always"] * (every == 1)
-        yield [f"visit {who}{end}" for who in _who(lettered, sensors, lowered) for end in ends]
+        yield [f"visit {form}{end}" for form in _sensor_forms(lettered, sensors, lowered) for end in ends]
     for weight, sensors in values["weight"].items():
-        who = _who(lettered, sensors, lowered)
+        forms = _sensor_forms(lettered, sensors, lowered)
         factors = [one for one, number in lettered.numbers.items() if _factor(number) == weight]
-        yield [f"ignore {w}" for w in who] if weight == 0 else [f"weigh {w} {one}" for w in who for one in factors]
+        yield (
+            [f"ignore {form}" for form in forms]
+            if weight == 0
+            else [f"weigh {form} {one}" for form in forms for one in factors]
+        )
     for kind, level in (("max", guidance.max_velocity), ("min", guidance.min_velocity)):
         if level is not None:
             yield [f"{kind} {one}" for one in lettered.numbers if _level(lettered, f"{kind} {one}", kind) == level]
     if forbidden := list(guidance.forbidden_velocities):
-        forms = [[one for one in lettered.numbers if _avoids(lettered, one) == level] for level in forbidden]
-        if forbidden[0] == 0 and not forms[0]:
+        letters_of = [[one for one in lettered.numbers if _avoids(lettered, one) == level] for level in forbidden]
+        if forbidden[0] == 0 and not letters_of[0]:
             yield [MOVE]
-            forms = forms[1:]
-        if forms:
-            yield [f"avoid {' '.join(letters)}" for letters in product(*forms)]
+            letters_of = letters_of[1:]
+        if letters_of:
+            yield [f"avoid {' '.join(letters)}" for letters in product(*letters_of)]
 
 
-def _who(lettered: LetteredNote, sensors: list[int], lowered: str) -> list[str]:
+def _sensor_forms(lettered: LetteredNote, sensors: list[int], lowered: str) -> list[str]:
     """The forms of an order's sensors: their letters, a range, or all."""
     own = [
         [one for one, number in lettered.numbers.items() if number.unit is None and number.value == sensor]

@@ -34,7 +34,7 @@ class Pretrain:
     """
 
     rollouts: Annotated[tyro.conf.Positional[tuple[Path, ...]], arg(metavar="FILE FILE...")]
-    """What `python -m lab explore` wrote, one file or more."""
+    """Files that `python -m lab explore` wrote, one or more."""
     out: Annotated[Path, arg(metavar="FILE")]
     """Checkpoint to write. The package's own are service/checkpoints/paper.npz and reach.npz, one a feature preset."""
     features: Features = "paper"

@@ -117,13 +117,13 @@ def losses(modules: Modules, batch: ExampleBatch, temperature: float = 1.0) -> t
     can send something.
     """
     scores, z = modules.attention(batch.features, batch.admissible)
-    everyone = torch.arange(len(batch))
+    rows = torch.arange(len(batch))
 
     def values(choices: Choices) -> Tensor:
-        u: Tensor = modules.velocity(z[everyone, choices.chosen], choices.approach)
+        u: Tensor = modules.velocity(z[rows, choices.chosen], choices.approach)
         return u
 
-    predicted = scores[everyone, batch.logged.chosen], values(batch.logged)[everyone, batch.logged.velocity]
+    predicted = scores[rows, batch.logged.chosen], values(batch.logged)[rows, batch.logged.velocity]
     regression = sum(((guess - batch.reward) ** 2).mean() for guess in predicted)
     logits = scores.masked_fill(~batch.admissible, -torch.inf) / temperature
     sensor = functional.cross_entropy(logits, batch.teacher.chosen, reduction="none")
