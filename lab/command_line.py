@@ -1,4 +1,4 @@
-"""``python -m lab COMMAND``: what is studied beside the product: experiments, training, and their records."""
+"""``python -m lab COMMAND``: the studies of the laboratory: experiments, training, and their records."""
 
 from __future__ import annotations
 

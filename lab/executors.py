@@ -14,9 +14,9 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 
 from shared.kit.ray_connection import RayUnusable, connected
 
-# A task whose worker dies is given to another one so many times: each of them may be killed, or lack memory.
+# The number of times that a task whose worker dies is retried: a worker may be killed, or lack memory.
 _RETRIES = 10
-# Tasks of an ordered map that are given out and not yet consumed: more than the cores of a cluster, less than fills
+# Tasks of an ordered map whose results are not consumed yet: more than the cores of a cluster, and few enough for
 # this process's memory.
 _AHEAD = 256
 

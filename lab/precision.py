@@ -1,4 +1,4 @@
-"""The numbers that the LLM's weights have in training."""
+"""The number format of the LLM's weights in training."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def main(argv: list[str]) -> int:
 
 
 def claims_map(options: MapOptions, console: Console) -> int:
-    """Fly what is missing, judge, write; returns the exit code.
+    """Fly the missing flights, judge and write; returns the exit code.
 
     Raises:
         UsageError: an option is out of bounds, or the folder cannot be written.
@@ -56,20 +56,22 @@ def claims_map(options: MapOptions, console: Console) -> int:
     seeds = options.seeds if options.seeds is not None else QUICK_SEEDS if options.quick else SEEDS
     check_between("--seeds", seeds, 2, 1000)
     # Torch and numba take seconds to import; `--help` and usage errors do without them.
-    from lab.claims_map.flights import SCHEMES, Flown, fly_all, kept_at
+    from lab.claims_map.flights import SCHEMES, Flown, flights_file, fly_all
     from lab.claims_map.judging import judge
     from lab.claims_map.points import points
     from lab.claims_map.writing import CURVES, FIGURE, VERDICTS, draw, write_curves, write_verdicts
 
-    kept, wanted, complete = options.out / "flights", points(options.quick), []
+    folder, settings, complete = options.out / "flights", points(options.quick), []
     with naming_out(options.out):
         if options.written:
-            complete = [p for p in wanted if all(kept_at(kept, p, scheme, seeds).exists() for scheme in SCHEMES)]
+            complete = [
+                p for p in settings if all(flights_file(folder, p, scheme, seeds).exists() for scheme in SCHEMES)
+            ]
         else:
-            complete = list(fly_all(wanted, seeds, kept, console))
+            complete = list(fly_all(settings, seeds, folder, console))
         if not complete:
-            raise UsageError(f"--written: {kept} has no setting with every scheme's flights in {seeds} worlds")
-        flights = [{s: Flown.load(kept_at(kept, point, s, seeds)) for s in SCHEMES} for point in complete]
+            raise UsageError(f"--written: {folder} has no setting with every scheme's flights in {seeds} worlds")
+        flights = [{s: Flown.load(flights_file(folder, point, s, seeds)) for s in SCHEMES} for point in complete]
         judged = [(point, judge(flown)) for point, flown in zip(complete, flights, strict=True)]
         write_verdicts(options.out / VERDICTS, judged, seeds)
         write_curves(options.out / CURVES, complete, flights)

@@ -31,7 +31,7 @@ def _settings() -> Settings:
 
 @dataclass(frozen=True)
 class EdgeDecider:
-    """What decides at the edge: mode ``value``, or look-ahead in the LLM's place.
+    """The decider at the edge: mode ``value``, or look-ahead in the LLM's place.
 
     Attributes:
         by: ``value``, the learned values; ``look_ahead``, one step of look-ahead among the sensors that attention
@@ -95,12 +95,12 @@ class EdgeFleet:
         return action
 
     def observe(self, request: DecideRequest) -> None:
-        """As ``Mission.observe``; a state from each UAV's own reports does not read the belief, so it stays unfed."""
+        """As ``Mission.observe``; without the belief where states have each UAV's own reports and do not read it."""
         if self.mission.belief_source == "fleet":
             self.mission.observe(request, request.step)
             return
-        heard = arrays_of(request.sensors)
-        self.mission.records.hear(heard.ids, heard.beacon, heard.queue)
+        columns = arrays_of(request.sensors)
+        self.mission.records.hear(columns.ids, columns.beacon, columns.queue)
         self.mission.reservations.attempt(request.step, request.uav_id)
 
     def take(self, uav: int, cost: float, failed: bool) -> None:

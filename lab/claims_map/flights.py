@@ -18,7 +18,7 @@ from shared.world.scenario import Scenario
 from simulator.policies.registry import policy_named
 from simulator.world.environment import PipelineWorld
 
-# The paper's view: its five features, and what each UAV heard itself.
+# The paper's view: its five features, and each UAV's own reports.
 _VIEW = {"features": "paper", "belief": "reported"}
 KEPT = (3, 5, 7)
 STARTS = {"shipped": "pretrained", "random": "random"}
@@ -53,7 +53,7 @@ class Flown:
         failed: failed transmissions in each step, ``(S, T)``.
         overflows: sensors that overflowed in each step, ``(S, T)``.
         visits: successful transmissions of each sensor, ``(S, J)``.
-        seconds: that the missions took, ``()``.
+        seconds: duration of the missions, ``()``.
         commit: of the code that flew them; empty outside a repository.
     """
 
@@ -65,7 +65,7 @@ class Flown:
     commit: str
 
     def save(self, path: Path) -> None:
-        """Write to a compressed file, whole or not at all."""
+        """Write to a compressed file, atomically."""
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(".part.npz")
         np.savez_compressed(part, **vars(self))
@@ -130,17 +130,17 @@ def _fly_learned(scheme: str, scenario: Scenario, seeds: Sequence[int]) -> tuple
     return lost, np.stack([o.failed.sum(axis=1) for _, o in steps], axis=1), overflows, visits
 
 
-def kept_at(folder: Path, point: Point, scheme: str, seeds: int) -> Path:
+def flights_file(folder: Path, point: Point, scheme: str, seeds: int) -> Path:
     """The file of a scheme's flights at a point in the worlds 0 to ``seeds`` - 1."""
     return folder / f"{point.name}-{scheme}-{seeds}.npz"
 
 
 def fly_all(points: Sequence[Point], seeds: int, folder: Path, console: Console) -> Iterator[Point]:
-    """Fly what is missing, point by point; yields each point that is complete."""
+    """Fly the missing flights, point by point; yields each point once its flights are complete."""
     for number, point in enumerate(points, 1):
         began, flew = time.perf_counter(), 0
         for scheme in SCHEMES:
-            path = kept_at(folder, point, scheme, seeds)
+            path = flights_file(folder, point, scheme, seeds)
             if not path.exists():
                 fly(scheme, point.scenario, range(seeds)).save(path)
                 flew += 1

@@ -1,6 +1,6 @@
-"""The paper's claims at one point of the map: each with our numbers, and for which stand-ins of its method it holds.
+"""The paper's claims at one point of the map: our numbers, and the stand-ins of its method for which each holds.
 
-The paper's own LLM is not at hand. Three deciders stand in for its method: look-ahead behind attention (k = 5) from a
+The paper's own LLM is not available. Three deciders stand in for its method: look-ahead behind attention (k = 5) from a
 random and from the shipped start, and mode `value`.
 """
 
@@ -22,19 +22,19 @@ from simulator.records.decision import jain_index
 # The paper's initial transient, steps 0 to 3.
 TRANSIENT_STEPS = 4
 BASELINES = ("eof", "wqcs", "madqn_paper", "mappo")
-# By the letter that stands for it in the figure.
+# The stand-ins by their letters in the figure.
 STAND_INS = {"r": chooser_name("random", 5), "s": chooser_name("shipped", 5), "v": "value"}
 Flights = Mapping[str, Flown]
 
 
 @dataclass(frozen=True)
-class Held:
-    """A claim at one point.
+class Judgement:
+    """The judgement of a claim at one point.
 
     Attributes:
         of: the stand-ins, starts or schemes for which it was judged, and whether it holds for each.
         ours: our numbers, in words.
-        moot: nothing is lost that the claim could differ in, so it is not judged.
+        moot: whether the claim is not judged, because hardly a packet is lost.
     """
 
     of: dict[str, bool]
@@ -43,21 +43,21 @@ class Held:
 
     @property
     def share(self) -> float:
-        """The share of them for which it holds; NaN if it is moot."""
+        """The share of ``of`` for which the claim holds; NaN if it is moot."""
         return float("nan") if self.moot else sum(self.of.values()) / len(self.of)
 
 
 @dataclass(frozen=True)
 class MapClaim:
-    """One of the paper's claims, in our words and short, with the rule that judges it."""
+    """One of the paper's claims, abridged, with the rule that judges it."""
 
     name: str
     stated: str
-    rule: Callable[[Flights], Held]
+    rule: Callable[[Flights], Judgement]
 
 
 def settled_step(flown: Flown) -> int | None:
-    """Where the mean of a scheme's lost packets over worlds settles."""
+    """The step at which a scheme's lost packets, averaged over worlds, settle."""
     return settled_at(flown.lost.mean(axis=0))
 
 
@@ -65,7 +65,7 @@ def _worlds(flown: Flown) -> list[float]:
     return [float(total) for total in flown.lost.sum(axis=1)]
 
 
-def _apart(flights: Flights, scheme: str, reference: str, steps: slice = slice(None)) -> Paired:
+def _difference(flights: Flights, scheme: str, reference: str, steps: slice = slice(None)) -> Paired:
     ours, theirs = (flights[name].lost[:, steps].sum(axis=1).tolist() for name in (scheme, reference))
     return paired(scheme, reference, "lost_packets", ours, theirs)[0]
 
@@ -74,89 +74,91 @@ def _at(step: int | None) -> str:
     return "never" if step is None else f"step {step}"
 
 
-def _zero_by_four(flights: Flights) -> Held:
+def _zero_by_four(flights: Flights) -> Judgement:
     at = {letter: settled_step(flights[name]) for letter, name in STAND_INS.items()}
     held = {letter: step is not None and step <= OURS_ZERO_AT for letter, step in at.items()}
-    return Held(held, _steps(at))
+    return Judgement(held, _steps(at))
 
 
 def _steps(at: Mapping[str, int | None]) -> str:
     return "; ".join(f"{name}: {_at(step)}" for name, step in at.items())
 
 
-def _zero_near(names: Sequence[str], stated: int, flights: Flights) -> Held:
+def _zero_near(names: Sequence[str], stated: int, flights: Flights) -> Judgement:
     at = {name: settled_step(flights[name]) for name in names}
-    return Held({n: s is not None and abs(s - stated) <= NEAR_STEPS for n, s in at.items()}, _steps(at))
+    return Judgement({n: s is not None and abs(s - stated) <= NEAR_STEPS for n, s in at.items()}, _steps(at))
 
 
-def _first(flights: Flights) -> Held:
+def _first(flights: Flights) -> Judgement:
     ours = {letter: settled_step(flights[name]) for letter, name in STAND_INS.items()}
     theirs = [settled_step(flights[name]) for name in BASELINES[:3]]
     soonest = min((step for step in theirs if step is not None), default=None)
     held = {n: s is not None and (soonest is None or s < soonest) for n, s in ours.items()}
-    return Held(held, f"{_steps(ours)}; EOF, WQCS, MADQN: {', '.join(map(_at, theirs))}")
+    return Judgement(held, f"{_steps(ours)}; EOF, WQCS, MADQN: {', '.join(map(_at, theirs))}")
 
 
-def _against_baselines(flights: Flights, steps: slice, more: bool) -> Held:
-    held, words = dict[str, bool](), list[str]()
+def _against_baselines(flights: Flights, steps: slice, more: bool) -> Judgement:
+    held, texts = dict[str, bool](), list[str]()
     for letter, name in STAND_INS.items():
-        apart = [_apart(flights, name, baseline, steps) for baseline in BASELINES]
-        held[letter] = all(d.low > 0 if more else d.high < 0 for d in apart)
-        words.append(f"{letter}: {', '.join(f'{d.mean:.1f} to {b}' for d, b in zip(apart, BASELINES, strict=True))}")
-    return Held(held, "; ".join(words))
+        differences = [_difference(flights, name, baseline, steps) for baseline in BASELINES]
+        held[letter] = all(d.low > 0 if more else d.high < 0 for d in differences)
+        texts.append(
+            f"{letter}: {', '.join(f'{d.mean:.1f} to {b}' for d, b in zip(differences, BASELINES, strict=True))}"
+        )
+    return Judgement(held, "; ".join(texts))
 
 
-def _fewest(flights: Flights) -> Held:
+def _fewest(flights: Flights) -> Judgement:
     return _against_baselines(flights, slice(None), more=False)
 
 
-def _larger_transient(flights: Flights) -> Held:
+def _larger_transient(flights: Flights) -> Judgement:
     return _against_baselines(flights, slice(0, TRANSIENT_STEPS), more=True)
 
 
-def _mappo_stable(flights: Flights) -> Held:
-    """The first and the last third differ by no more than the paired interval, and losses go on."""
+def _mappo_stable(flights: Flights) -> Judgement:
+    """The paired interval of the last third less the first contains 0, and losses go on."""
     lost = flights["mappo"].lost
     third = lost.shape[1] // 3
     early, late = (lost[:, part].mean(axis=1).tolist() for part in (slice(0, third), slice(-third, None)))
-    apart = paired("late", "early", "lost_packets", late, early)[0]
+    change = paired("late", "early", "lost_packets", late, early)[0]
     goes_on = float(lost.mean()) > ZERO
-    words = f"{np.mean(early):.2f} a step in the first third, {np.mean(late):.2f} in the last"
-    return Held({"mappo": goes_on and apart.low <= 0 <= apart.high}, words)
+    text = f"{np.mean(early):.2f} a step in the first third, {np.mean(late):.2f} in the last"
+    return Judgement({"mappo": goes_on and change.low <= 0 <= change.high}, text)
 
 
 def _by_start(
     flights: Flights, others: Callable[[str], Sequence[tuple[str, str]]], agrees: Callable[[Paired], bool]
-) -> Held:
-    """Pairs of choosers by the start; moot where no chooser of any pair loses more than ``ZERO`` a step."""
-    held, words, most = dict[str, bool](), list[str](), 0.0
+) -> Judgement:
+    """Pairs of choosers by the start; moot if no chooser of any pair loses more than ``ZERO`` a step."""
+    held, texts, most = dict[str, bool](), list[str](), 0.0
     for start in STARTS:
-        apart = [_apart(flights, scheme, reference) for scheme, reference in others(start)]
-        held[start[0]] = all(map(agrees, apart))
-        words += [f"{d.scheme} less {d.reference}: {d.mean:.1f} [{d.low:.1f}, {d.high:.1f}]" for d in apart]
+        differences = [_difference(flights, scheme, reference) for scheme, reference in others(start)]
+        held[start[0]] = all(map(agrees, differences))
+        texts += [f"{d.scheme} less {d.reference}: {d.mean:.1f} [{d.low:.1f}, {d.high:.1f}]" for d in differences]
         most = max(most, *(float(flights[name].lost.mean()) for pair in others(start) for name in pair))
-    return Held(held, "; ".join(words), moot=most <= ZERO)
+    return Judgement(held, "; ".join(texts), moot=most <= ZERO)
 
 
-def _attention_harmless(flights: Flights) -> Held:
+def _attention_harmless(flights: Flights) -> Judgement:
     return _by_start(flights, lambda s: [(chooser_name(s, 5), EVERY_SENSOR)], lambda d: d.low <= 0 <= d.high)
 
 
-def _three_worse(flights: Flights) -> Held:
+def _three_worse(flights: Flights) -> Judgement:
     return _by_start(flights, lambda s: [(chooser_name(s, 3), chooser_name(s, 5))], lambda d: d.low > 0)
 
 
-def _more_no_better(flights: Flights) -> Held:
+def _more_no_better(flights: Flights) -> Judgement:
     def pairs(start: str) -> list[tuple[str, str]]:
         return [(other, chooser_name(start, 5)) for other in (chooser_name(start, KEPT[-1]), EVERY_SENSOR)]
 
     return _by_start(flights, pairs, lambda d: d.high >= 0)
 
 
-def _even(flights: Flights) -> Held:
+def _even(flights: Flights) -> Judgement:
     found = {n: interval([jain_index(w) or 0.0 for w in flights[s].visits.tolist()]) for n, s in STAND_INS.items()}
-    words = "; ".join(f"{name}: {index.mean:.3f}" for name, index in found.items())
-    return Held({name: index.high >= JAIN - NEAR_JAIN for name, index in found.items()}, words)
+    text = "; ".join(f"{name}: {index.mean:.3f}" for name, index in found.items())
+    return Judgement({name: index.high >= JAIN - NEAR_JAIN for name, index in found.items()}, text)
 
 
 CLAIMS: tuple[MapClaim, ...] = (
@@ -182,19 +184,19 @@ CLAIMS: tuple[MapClaim, ...] = (
 )
 
 
-def judge(flights: Flights) -> dict[str, Held]:
+def judge(flights: Flights) -> dict[str, Judgement]:
     """Every claim at one point, by its name."""
     return {claim.name: claim.rule(flights) for claim in CLAIMS}
 
 
-def most_held(held: Mapping[str, Held]) -> tuple[str, int]:
+def most_held(held: Mapping[str, Judgement]) -> tuple[str, int]:
     """The stand-in for which most of the claims hold, and their number; a moot claim does not count.
 
     A claim on the baselines alone holds if it holds for all that it names. A claim on attention's k is judged for the
     stand-in's start; mode `value` has the shipped one.
     """
 
-    def holds(claim: Held, letter: str) -> bool:
+    def holds(claim: Judgement, letter: str) -> bool:
         if claim.moot:
             return False
         if set(claim.of) <= set(BASELINES):

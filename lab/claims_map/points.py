@@ -1,4 +1,4 @@
-"""The settings of the claims map: what the paper leaves open, varied around scenario ``paper``."""
+"""The settings of the claims map: the numbers that the paper leaves open, varied around scenario ``paper``."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Point:
     @property
     def name(self) -> str:
         """Its name in files."""
-        words = "".join(c if c.isalnum() or c == "." else "_" for c in self.row)
-        return f"{words}-{self.rate:g}"
+        row = "".join(c if c.isalnum() or c == "." else "_" for c in self.row)
+        return f"{row}-{self.rate:g}"
 
 
 def fill_row(fill: tuple[float, float]) -> str:

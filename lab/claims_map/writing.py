@@ -17,14 +17,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
 from lab.claims_map.flights import SCHEMES, Flown
-from lab.claims_map.judging import CLAIMS, Held, MapClaim, most_held, settled_step
+from lab.claims_map.judging import CLAIMS, Judgement, MapClaim, most_held, settled_step
 from lab.claims_map.points import RATES, ROWS, VARIANTS, Point, fill_row
 from lab.experiments.plots import PRINT, rounded
 from shared.world.channel import FloatArray
 from simulator.reporting.figure_style import DOUBLE_IN
 
 VERDICTS, CURVES, FIGURE = "claims-map.csv", "claims-map-curves.csv", "claims-map"
-Judged = Sequence[tuple[Point, Mapping[str, Held]]]
+Judged = Sequence[tuple[Point, Mapping[str, Judgement]]]
 
 # White where a claim fails, darker the more stand-ins it holds for.
 _SHADES = ListedColormap(["#ffffff", "#c6dbef", "#9ecae1", "#6baed6", "#2171b5"])
@@ -36,21 +36,21 @@ _NOT_FLOWN: dict[str, Any] = {"facecolor": "#ffffff", "edgecolor": "#cccccc", "h
 
 
 def write_verdicts(path: Path, judged: Judged, seeds: int) -> None:
-    """A line a setting and claim: what it holds for, what it fails for, and our numbers."""
+    """Write a line a setting and claim: the schemes for which it holds or fails, and our numbers."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["row", "arrivals", "claim", "stated", "holds_for", "fails_for", "moot", "worlds", "ours"])
         for point, held in judged:
             for claim in CLAIMS:
                 found = held[claim.name]
-                sides = [" ".join(n for n, holds in found.of.items() if holds is wanted) for wanted in (True, False)]
+                sides = [" ".join(n for n, holds in found.of.items() if holds is side) for side in (True, False)]
                 stated = claim.stated.replace("\n", " ")
-                given = [point.row, f"{point.rate:g}", claim.name, stated, *sides, int(found.moot), seeds, found.ours]
-                writer.writerow(given)
+                row = [point.row, f"{point.rate:g}", claim.name, stated, *sides, int(found.moot), seeds, found.ours]
+                writer.writerow(row)
 
 
 def write_curves(path: Path, points: Sequence[Point], flights: Sequence[Mapping[str, Flown]]) -> None:
-    """A line a setting and scheme: where it settles, its losses of a mission, and the mean lost packets by step."""
+    """Write a line a setting and scheme: the step where it settles, its losses, and the mean lost packets by step."""
     steps = max(point.scenario.steps for point in points)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -59,16 +59,16 @@ def write_curves(path: Path, points: Sequence[Point], flights: Sequence[Mapping[
         )
         for point, flown in zip(points, flights, strict=True):
             for scheme in SCHEMES:
-                one = flown[scheme]
-                totals = [f"{part.sum(axis=1).mean():.2f}" for part in (one.lost, one.failed, one.overflows)]
-                at, means = settled_step(one), [f"{mean:.3g}" for mean in one.lost.mean(axis=0)]
+                flight = flown[scheme]
+                totals = [f"{part.sum(axis=1).mean():.2f}" for part in (flight.lost, flight.failed, flight.overflows)]
+                at, means = settled_step(flight), [f"{mean:.3g}" for mean in flight.lost.mean(axis=0)]
                 writer.writerow(
-                    [point.row, f"{point.rate:g}", scheme, "" if at is None else at, *totals, one.commit, *means]
+                    [point.row, f"{point.rate:g}", scheme, "" if at is None else at, *totals, flight.commit, *means]
                 )
 
 
 def draw(folder: Path, judged: Judged, seeds: int) -> None:
-    """The figure: a panel a claim and one of their number; a row a setting, a column the mean arrivals."""
+    """Draw the figure: a panel a claim, and one of their number; a row a setting, a column the mean arrivals."""
     with matplotlib.style.context(["default", {**PRINT, "svg.hashsalt": FIGURE}]):
         figure = Figure(figsize=(DOUBLE_IN, 6.9), layout="constrained")
         panels = list(figure.subplots(3, 4, sharex=True, sharey=True).flat)

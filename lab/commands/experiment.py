@@ -200,7 +200,7 @@ def _commands(name: str, argv: list[str]) -> Callable[[Experiment], str]:
     """The command that makes one experiment, as its result names it: without the folder, which changes no number."""
     rest = list(argv)
     rest.remove(name)
-    out = next((at for at, word in enumerate(rest) if word.partition("=")[0] == "--out"), None)
+    out = next((at for at, argument in enumerate(rest) if argument.partition("=")[0] == "--out"), None)
     if out is not None:
         del rest[out : out + (1 if "=" in rest[out] else 2)]
     return lambda experiment: shlex.join(["python", "-m", "lab", "experiment", experiment.name, *rest])

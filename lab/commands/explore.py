@@ -54,8 +54,8 @@ class Explore(ScenarioChanges):
     number of workers. `--first` adds further worlds in a file of their own; `python -m lab pretrain` takes several
     files, of several scenarios.
 
-    With `--edge` the UAVs fly that edge's decisions, and the teacher's action in each state is recorded beside them.
-    So an LLM learns from the states that its own decisions bring about (DAgger, Ross et al. 2011). With `--policy` they
+    With `--edge` the UAVs fly that edge's decisions, and the records also have the teacher's action in each state.
+    So an LLM learns from the states that its own decisions lead to (DAgger, Ross et al. 2011). With `--policy` they
     fly that policy's: `lab.experiments.formula_planner:FormulaPlanner` believes in the formulas' links and so brings
     about failures that a teacher avoids.
     """

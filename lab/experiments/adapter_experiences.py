@@ -1,4 +1,4 @@
-"""The embedded LLM with its adapter, in a view of which its fleet has learned nothing, with and without experiences."""
+"""The embedded LLM with its adapter, in a view without learned links, with and without experiences."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from lab.experiments.result import Interval, Paired, Result
 from shared.world.scenario import Scenario
 
 CLAIM_SEEDS = 30
-# The experiment whose schemes, by the paper's names for them, are of the LLM with the adapter.
+# The experiment whose schemes have the paper's names, and the LLM with the adapter.
 WITH_ADAPTER = adapter_claims.EXPERIMENT.name
 # The tolerance of "zero at step 20" in steps.
 NEAR_STEPS = 4
@@ -36,7 +36,7 @@ OURS_ZERO_AT, HEURISTICS_ZERO_AT, MADQN_ZERO_AT = 4, 20, 27
 TOKENS_WITHOUT, TOKENS_WITH = 213.7, 106.8
 JAIN = 0.980
 NEAR_JAIN, NEAR_SAVED_POINTS = 0.01, 5.0
-# The paper's baselines; its MAPPO on the plain state was not trained, and ours sees more.
+# The paper's baselines; the paper's MAPPO on the plain state is not trained here, and ours has more features.
 RIVALS = ("eof", "wqcs", "madqn_paper", "mappo")
 # The method without attention.
 UNATTENDED = "llm_all"
@@ -108,18 +108,18 @@ def _finding(claim: Claim, runs: Runs) -> ClaimFinding:
         return ClaimFinding(claim.stated, claim.experiment, "", None, "not run")
     try:
         judged = claim.rule(result, runs)
-    except Unmeasured as lack:
-        return ClaimFinding(claim.stated, claim.experiment, "", None, f"not measured: {lack}", model=result.model)
+    except Unmeasured as error:
+        return ClaimFinding(claim.stated, claim.experiment, "", None, f"not measured: {error}", model=result.model)
     if result.quick:
         why = "quick run: no verdict"
         return ClaimFinding(claim.stated, claim.experiment, judged.ours, None, why, judged.seeds, result.model)
-    not_the_papers = elsewhere(result)
-    verdict = Verdict.NOT_COMPARABLE if not_the_papers else judged.verdict
-    why = not_the_papers or judged.why
+    other_setting = setting_difference(result)
+    verdict = Verdict.NOT_COMPARABLE if other_setting else judged.verdict
+    why = other_setting or judged.why
     return ClaimFinding(claim.stated, claim.experiment, judged.ours, verdict, why, judged.seeds, result.model)
 
 
-def elsewhere(result: Result) -> str | None:
+def setting_difference(result: Result) -> str | None:
     """The difference from the paper's worlds and missions; ``None`` if there is none."""
     paper = Scenario()
     if result.scenario != paper.name:
@@ -199,16 +199,16 @@ def _settling(means: Sequence[float]) -> str:
 
 def _loses_least(result: Result, runs: Runs) -> Judged:
     rivals = {name: measured(result, name, "lost_packets") for name in RIVALS}
-    apart = {name: difference(result, METHOD, name, "lost_packets") for name, found in rivals.items() if found}
+    differences = {name: difference(result, METHOD, name, "lost_packets") for name, found in rivals.items() if found}
     missing = [name for name, found in rivals.items() if not found]
-    won = all(d.high < 0 for d in apart.values())
-    if missing and won:
+    loses_least = all(d.high < 0 for d in differences.values())
+    if missing and loses_least:
         raise Unmeasured(f"lost_packets of {', '.join(missing)}")
-    ours = "; ".join(f"to {label_of(result, name)} {_text(d)} packets" for name, d in apart.items())
-    seeds = seeds_flown(result, METHOD, *apart)
-    if won:
+    ours = "; ".join(f"to {label_of(result, name)} {_text(d)} packets" for name, d in differences.items())
+    seeds = seeds_flown(result, METHOD, *differences)
+    if loses_least:
         return Judged(ours, Verdict.REPRODUCED, "fewer than each, by paired intervals", seeds)
-    better = [label_of(result, name) for name, d in apart.items() if d.low > 0]
+    better = [label_of(result, name) for name, d in differences.items() if d.low > 0]
     why = f"fewer are lost by {', '.join(better)}" if better else "an interval holds 0"
     if beats_chance(result, runs) is False:
         why += f"; {_NO_BETTER}"
@@ -218,10 +218,10 @@ def _loses_least(result: Result, runs: Runs) -> Judged:
 # --- tokens
 
 
-def _halved(what: str, block: str, why_not: str) -> Callable[[Result, Runs], Judged]:
+def _halved(text: str, block: str, why_not: str) -> Callable[[Result, Runs], Judged]:
     def rule(result: Result, runs: Runs) -> Judged:
         saved, seeds = _saved(result, block)
-        ours = f"{what} {_text(saved)} % shorter"
+        ours = f"{text} {_text(saved)} % shorter"
         stated = 100 * (1 - TOKENS_WITH / TOKENS_WITHOUT)
         if abs(saved.mean - stated) <= NEAR_SAVED_POINTS:
             why = f"within {NEAR_SAVED_POINTS:g} points of {stated:.0f} %"
@@ -250,9 +250,9 @@ def _token_counts(result: Result, runs: Runs) -> Judged:
     unattended = measured(result, UNATTENDED, "prompt_tokens") is not None
     whole, counted = (UNATTENDED, "tokens") if unattended else (name, "uncompressed")
     ours = "; ".join(
-        f"{what} {interval_of(result, whole, f'{block}_{counted}').mean:.1f}"
+        f"{label} {interval_of(result, whole, f'{block}_{counted}').mean:.1f}"
         f" to {interval_of(result, name, f'{block}_tokens').mean:.1f}"
-        for what, block in (("prompt", "prompt"), ("state block", "state"))
+        for label, block in (("prompt", "prompt"), ("state block", "state"))
     )
     why = "another wording and row format; only the ratio can be compared"
     return Judged(ours, Verdict.NOT_COMPARABLE, why, seeds_flown(result, name))
@@ -289,12 +289,12 @@ def _fair(result: Result, runs: Runs) -> Judged:
 
 
 def _attention_harmless(result: Result, runs: Runs) -> Judged:
-    apart = difference(result, METHOD, UNATTENDED, "lost_packets")
-    ours = f"with less without attention: {_text(apart)} packets"
+    paired = difference(result, METHOD, UNATTENDED, "lost_packets")
+    ours = f"with less without attention: {_text(paired)} packets"
     seeds = seeds_flown(result, METHOD, UNATTENDED)
     if beats_chance(result, runs) is False:
         return Judged(ours, Verdict.NOT_COMPARABLE, _RANKING_ALONE, seeds)
-    if apart.low <= 0 <= apart.high:
+    if paired.low <= 0 <= paired.high:
         return Judged(
             ours, Verdict.REPRODUCED, "the paired interval holds 0; its width says how much could hide", seeds
         )
@@ -318,19 +318,26 @@ def _more_is_no_better(result: Result, runs: Runs) -> Judged:
 
 
 def _against_five(
-    result: Result, runs: Runs, which: Callable[[int], bool], agrees: Callable[[Paired], bool], so: str, but: str
+    result: Result,
+    runs: Runs,
+    which: Callable[[int], bool],
+    agrees: Callable[[Paired], bool],
+    confirmed: str,
+    refuted: str,
 ) -> Judged:
     names = _by_k(result)
     others = {k: name for k, name in sorted(names.items()) if which(k)}
     if 5 not in names or not others:
         raise Unmeasured("lost packets at k=5 and at the k to compare")
-    apart = {k: difference(result, name, names[5], "lost_packets") for k, name in others.items()}
-    ours = "; ".join(f"k={k} less k=5: {_text(d)} packets" for k, d in apart.items())
+    differences = {k: difference(result, name, names[5], "lost_packets") for k, name in others.items()}
+    ours = "; ".join(f"k={k} less k=5: {_text(d)} packets" for k, d in differences.items())
     seeds = seeds_flown(result, names[5], *others.values())
     if beats_chance(result, runs) is False:
         return Judged(ours, Verdict.NOT_COMPARABLE, _RANKING_ALONE, seeds)
-    reproduced = all(map(agrees, apart.values()))
-    return Judged(ours, Verdict.REPRODUCED if reproduced else Verdict.NOT_REPRODUCED, so if reproduced else but, seeds)
+    reproduced = all(map(agrees, differences.values()))
+    return Judged(
+        ours, Verdict.REPRODUCED if reproduced else Verdict.NOT_REPRODUCED, confirmed if reproduced else refuted, seeds
+    )
 
 
 CLAIMS: tuple[Claim, ...] = (

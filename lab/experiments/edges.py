@@ -56,11 +56,11 @@ class Llm:
         return self.available if backing == NAMED_BY_OPTION else True
 
     def identity(self, backing: Backing) -> str:
-        """What decides behind an edge, in a flight's key: the LLM, and the weights with which the modules begin."""
+        """The identity of an edge's decider in a flight's key: the LLM, and the initial weights of the modules."""
         return f"{self._llm_of(backing)} {_modules()}"
 
     def _llm_of(self, backing: Backing) -> str:
-        """The LLM; LLMs of one name answer alike."""
+        """The identity of the LLM; LLMs of the same name give the same answers."""
         if backing in (OFF, *STAND_INS):
             return backing
         if backing == NAMED_BY_OPTION:
@@ -162,7 +162,7 @@ def radio(url: str, deadline_ms: int | None, scenario: Scenario, seed: int) -> E
 
 
 def _adapter() -> Path:
-    """Where the adapter's file is, or would be."""
+    """The path of the adapter's file, which may not exist."""
     named = os.environ.get(_ADAPTER)
     return Path(named).resolve() if named else _checkpoints() / "adapter.gguf"
 

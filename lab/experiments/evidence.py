@@ -108,9 +108,9 @@ def beats_chance(result: Result, runs: Runs) -> bool | None:
 
     The comparison is within ``result``, or else within another run of the same LLM.
     """
-    beside = [run for run in runs.values() if _same_model(run, result) and (result.quick or not run.quick)]
+    others = [run for run in runs.values() if _same_model(run, result) and (result.quick or not run.quick)]
     for chance in CHANCE:
-        for run in (result, *beside):
+        for run in (result, *others):
             if measured(run, METHOD, "lost_packets") and measured(run, chance, "lost_packets"):
                 return difference(run, METHOD, chance, "lost_packets").high < 0
     return None

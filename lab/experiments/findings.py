@@ -43,7 +43,7 @@ def findings(
     if not flying:
         raise UsageError(f"experiment {plan.experiment.name}: no scheme could fly. {' '.join(notes)}")
     experiment, seeds = plan.experiment, max((group.seeds for group in flying), key=len)
-    schemes, curves, lacking = _scores(experiment, flying)
+    schemes, curves, missing = _scores(experiment, flying)
     compared = comparisons(experiment, flying, groups)
     return Result(
         experiment=experiment.name,
@@ -64,7 +64,7 @@ def findings(
         figures=[_figure(spec, flying, seeds, command) for spec in experiment.figures],
         labels=_labels(flying, experiment.measures, experiment.figures) | compared.labels,
         seeds_of={group.scheme.name: group.seeds for group in flying if group.seeds != seeds},
-        notes=[*experiment.notes, *compared.notes, *_notes(plan, setup, groups), *notes, *lacking],
+        notes=[*experiment.notes, *compared.notes, *_notes(plan, setup, groups), *notes, *missing],
     )
 
 
@@ -93,14 +93,14 @@ def _scores(
     """Measures and curves by scheme, and notes on missing ones."""
     schemes: dict[str, dict[str, Interval]] = {}
     curves: dict[str, dict[str, Curve]] = {}
-    lacking: list[str] = []
+    notes: list[str] = []
     for group in flying:
         found, missing = _measured(group, experiment.measures)
         schemes.setdefault(group.scheme.name, {}).update(found)
-        lacking += missing
+        notes += missing
         if drawn := _curves(group, experiment.figures):
             curves.setdefault(group.scheme.name, {}).update(drawn)
-    return schemes, curves, lacking
+    return schemes, curves, notes
 
 
 def _measured(group: Group, measures: Sequence[str]) -> tuple[dict[str, Interval], list[str]]:

@@ -42,7 +42,7 @@ class DecisionRecord(Record):
     """One decision and its outcome; the last five fields are ``None`` or empty for a decision without an edge.
 
     ``trust`` is the weight of each adviser before a decision of mode ``guided``, and empty in flights that were stored
-    before it was.
+    before it was recorded.
     """
 
     step: int
@@ -102,7 +102,7 @@ def flight_key(scheme: Scheme, identity: str | None, site: Site, seed: int) -> s
     arrivals = None if site.arrivals is None else hashlib.sha256(site.arrivals.tobytes()).hexdigest()
     decides: dict[str, Any] = scheme.decides.model_dump(mode="json")
     for newer in ("operator", "sensor_uplinks"):
-        # So the keys of flights without one are those of versions that had none.
+        # So flights without an operator keep the keys of versions without operators.
         if decides.get(newer) is None:
             decides.pop(newer, None)
     scenario = site.scenario.model_dump(mode="json")

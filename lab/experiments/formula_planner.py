@@ -1,4 +1,4 @@
-"""The planner without learning: a study of what the learned channel, drift and arrivals are worth."""
+"""The planner without learning: a study of the benefit of the learned channel, drift and arrivals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class _NoDrift(Drift):
 
 
 class _FormulaBelief(FleetBelief):
-    """The beacons' queues and the UAVs' positions; links, rates and ways are the formulas'."""
+    """A belief of the beacons' queues and the UAVs' positions, with the formulas' links, rates and drift."""
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__(scenario)
@@ -34,7 +34,7 @@ class _FormulaBelief(FleetBelief):
         return NOTHING_MEASURED
 
     def settle(self, uav: int, step: int, failed: bool) -> None:
-        """A transfer is what was planned, until a beacon says otherwise."""
+        """A transfer moves the planned packets, until a beacon reports otherwise."""
 
 
 class FormulaPlanner(RecedingHorizonPolicy):

@@ -1,4 +1,4 @@
-"""The planner that is told the true links: a reference for what learning a channel could reach at most."""
+"""The planner with the true links: a reference that bounds the benefit of learning the channel."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def true_links_of_plan(world: PipelineWorld, draft: Draft) -> list[IntArray]:
 class InformedPlanner(RecedingHorizonPolicy):
     """The planner of ``mpc`` with the true links of every step of its horizon.
 
-    They have shadowing, fading, dead radios, the links' share and the mean wind. Queues, arrivals and later gusts are
-    expected from what the UAVs have reported, as ``mpc`` does. No UAV could fly it: it reads the world's hidden state.
+    The links include shadowing, fading, dead radios, the links' share and the mean wind. Queues, arrivals and later
+    gusts are expected from the UAVs' reports, as in ``mpc``. No UAV could fly it: it reads the world's hidden state.
 
     Args:
         world: in the state that the decisions are for.
@@ -45,12 +45,12 @@ class InformedPlanner(RecedingHorizonPolicy):
         draft = super().draft(uav, taken)
         if draft is None or not self._world.truth.differs:
             return draft
-        told = true_links_of_plan(self._world, draft)
-        return replace(draft, problem=replace(draft.problem, links=told, chances=None))
+        links = true_links_of_plan(self._world, draft)
+        return replace(draft, problem=replace(draft.problem, links=links, chances=None))
 
 
 class InformedPilot(LocalPilot):
-    """The pilot of :class:`InformedPlanner`; it flies a twin of the world beside it, to read the twin's state.
+    """The pilot of :class:`InformedPlanner`; it flies a twin of the world in parallel, to read the twin's state.
 
     Args:
         site: of the world.

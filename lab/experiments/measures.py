@@ -75,10 +75,10 @@ def _mean(values: Iterable[float | None]) -> float | None:
 def _deadlines_met(flight: FlightRecord) -> float | None:
     """The percentage of the requested visits' deadlines that were met: :mod:`shared.planning.orders`."""
     met = total = 0
-    for wish in flight.meant.sensors if flight.meant is not None else []:
-        if wish.visit_every is not None:
-            served = {d.step for d in flight.decisions if d.sensor == wish.sensor_id and not d.failed}
-            kept, missed = count_deadlines(wish.visit_every, 0, flight.steps - 1, served)
+    for request in flight.meant.sensors if flight.meant is not None else []:
+        if request.visit_every is not None:
+            served = {d.step for d in flight.decisions if d.sensor == request.sensor_id and not d.failed}
+            kept, missed = count_deadlines(request.visit_every, 0, flight.steps - 1, served)
             met, total = met + kept, total + kept + missed
     return 100 * met / total if total else None
 
@@ -116,13 +116,13 @@ def _trip(q: float) -> Callable[[FlightRecord], float | None]:
     return percentile
 
 
-def _share(took: Callable[[DecisionRecord], float]) -> Callable[[FlightRecord], float | None]:
+def _share(time_ms: Callable[[DecisionRecord], float]) -> Callable[[FlightRecord], float | None]:
     """A time in percent of the mission's round-trip time."""
 
     def share(flight: FlightRecord) -> float | None:
         timed = [d for d in flight.decisions if d.rtt_ms is not None]
         whole = sum(d.rtt_ms or 0.0 for d in timed)
-        return 100 * sum(map(took, timed)) / whole if whole else None
+        return 100 * sum(map(time_ms, timed)) / whole if whole else None
 
     return share
 

@@ -1,4 +1,4 @@
-"""The obedience of a fleet to its operator's note, by the way of the note to the edge."""
+"""The obedience of a fleet to its operator's note, by the form in which the note reaches the edge."""
 
 from __future__ import annotations
 

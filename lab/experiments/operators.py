@@ -15,7 +15,7 @@ _POLL_S = 0.2
 
 
 class Intent(Record):
-    """A note and the guidance that it means."""
+    """A note and the guidance intended by it."""
 
     note: str
     meant: Guidance

@@ -156,7 +156,7 @@ def render_page(results: Mapping[str, Result], drawn: Mapping[str, Sequence[tupl
         lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
     environment.filters.update(cell=cell, rounded=rounded, seeds=seeds_text)
-    full = {name: result for name, result in results.items() if not (result.quick or claims.elsewhere(result))}
+    full = {name: result for name, result in results.items() if not (result.quick or claims.setting_difference(result))}
     often = Counter(note for result in results.values() for note in result.notes)
     judged = {
         "the LLM of `--llm`": claims.judge(results),

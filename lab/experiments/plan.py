@@ -31,7 +31,7 @@ class Setup:
 
     ``sites`` are the worlds by name; an experiment flies the first one, and those that it names. ``seeds`` and
     ``llm_seeds`` are numbers of seeds, from 0. ``steps`` are those of a mission, or ``None`` for the scenario's.
-    ``only`` names the schemes to fly, or none for all. ``policies`` are the user's own, flown beside the schemes.
+    ``only`` names the schemes to fly, or none for all. ``policies`` are the user's own, which fly too.
     """
 
     sites: dict[str, Site]
@@ -67,8 +67,8 @@ class Experiment:
     ``summary`` is its line in ``--help``. ``measures``, and the measures of curves in ``figures``, are names in
     ``measures.py``. Every other scheme is paired with each of ``references``; ``pairs`` are further pairs. With
     ``when_quick`` of ``short``, ``--quick`` shortens the missions of all schemes, so that they stay comparable; with
-    ``no_llm`` it omits the schemes that query an LLM. ``worlds`` are the setup's sites that it flies beside the first
-    one. On each site, the one of ``heuristics`` with the fewest lost packets is another reference for every other
+    ``no_llm`` it omits the schemes that query an LLM. ``worlds`` are the setup's sites that it flies besides the
+    first one. On each site, the one of ``heuristics`` with the fewest lost packets is another reference for every other
     scheme.
     """
 

@@ -272,18 +272,18 @@ def _sweep(result: Result, figure: Figure) -> mpl.Figure | None:
     )
     if not points:
         return None
-    beside = [
+    unswept = [
         name
         for name in result.schemes
         if name not in result.sweep.at and any(measured(result, name, measure) for measure in figure.measures)
     ]
     bounded = any(_bound_of(result, measure) is not None for measure in figure.measures)
     width = SINGLE_IN if len(figure.measures) == 1 else DOUBLE_IN
-    keys = len(beside) + bounded
+    keys = len(unswept) + bounded
     picture, panels = _panels(figure, 2.1, _legend_in(keys, width))
     for axes, measure in zip(panels, figure.measures, strict=True):
         _sweep_panel(axes, result, measure, points)
-        for name in beside:
+        for name in unswept:
             if reference := measured(result, name, measure):
                 axes.axhspan(reference.low, reference.high, color=looks[name][0], alpha=0.14, linewidth=0)
                 axes.axhline(reference.mean, color=looks[name][0], linestyle=looks[name][1])
@@ -291,7 +291,7 @@ def _sweep(result: Result, figure: Figure) -> mpl.Figure | None:
         _frame(axes, label_of(result, measure))
         _scale(axes.yaxis, [i.mean for name in result.schemes if (i := measured(result, name, measure))])
         axes.set_xlabel(result.sweep.label)
-    references = [_key(label_of(result, name), (looks[name][0], looks[name][1], "")) for name in beside]
+    references = [_key(label_of(result, name), (looks[name][0], looks[name][1], "")) for name in unswept]
     _legend(picture, references, bounded, width)
     return picture
 
@@ -303,8 +303,8 @@ def _sweep_panel(axes: Axes, result: Result, measure: str, points: Sequence[tupl
     for at, interval in found:
         seeds = [value for value in interval.values if _finite(value)]
         if len(seeds) > 1:
-            beside = at + 0.3 * gap * np.linspace(-0.5, 0.5, len(seeds))
-            axes.plot(beside, seeds, ".", color=colour, markersize=2, alpha=0.35)
+            positions = at + 0.3 * gap * np.linspace(-0.5, 0.5, len(seeds))
+            axes.plot(positions, seeds, ".", color=colour, markersize=2, alpha=0.35)
     mean = np.array([i.mean for _, i in found])
     reach = np.array([(max(0.0, i.mean - i.low), max(0.0, i.high - i.mean)) for _, i in found]).reshape(-1, 2).T
     axes.errorbar(

@@ -55,7 +55,7 @@ class Clairvoyant(Record):
 
 
 class Informed(Record):
-    """The planner that is told every true link, a reference: see ``lab.experiments.informed_planner``."""
+    """The planner with every true link, a reference: see ``lab.experiments.informed_planner``."""
 
     kind: Literal["informed"] = "informed"
 

@@ -1,4 +1,4 @@
-"""The worth of sensors that report to the edge themselves, such as by LoRaWAN, beside the UAVs that hear them."""
+"""The effect of sensors that report to the edge themselves, such as by LoRaWAN, besides their beacons to UAVs."""
 
 from __future__ import annotations
 

@@ -68,13 +68,13 @@ def worst(body: dict[str, Any]) -> str:
     return [letter for letter in letters if letter < (min(later) if later else "[")][-1]
 
 
-# The model name of each.
+# The model names of the stand-ins.
 NAMES: dict[Answer, str] = {drawn: "uniform draws", worst: "the worst"}
 
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
-    # Head and body are one segment: else the body waits up to 40 ms for the head's delayed acknowledgement.
+    # A buffer sends head and body in one segment: else the body waits up to 40 ms for the head's delayed ACK.
     wbufsize = -1
     answer: Answer
 

@@ -1,4 +1,4 @@
-"""Every scheme in worlds that differ from the edge's model, beside two that do not."""
+"""Every scheme in worlds that differ from the edge's model, and in two that do not."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class UplinkPlan(Record):
-    """Which sensors report, as a share of all, and the steps between two reports of one."""
+    """The share of sensors that report, and the steps between two reports of one sensor."""
 
     share: float
     every: int
@@ -28,7 +28,7 @@ class SensorUplinks:
 
     The seed draws the sensors that report, and for each the step of its first report, before its second could be due.
     A reading is sent once the fleet has its decisions of the step, so that decisions of the next step are the first to
-    reckon with it.
+    use it.
 
     Raises (``send``):
         EdgeError: the edge did not take the readings.
@@ -43,7 +43,7 @@ class SensorUplinks:
         self._first = draws.integers(plan.every, size=len(self._sensors))
 
     def send(self, step: int, sensors: Sensors) -> None:
-        """Send the readings of the sensors that report in a step, as their queues were at its start."""
+        """Send the readings of the sensors that report in a step, with their queues at its start."""
         due = self._sensors[(step - self._first) % self._every == 0]
         readings = [
             SensorReading(

@@ -1,4 +1,4 @@
-"""Training missions: UAVs explore a world, or fly an edge's decisions, beside a teacher or without one."""
+"""Training missions: UAVs explore a world, or fly an edge's decisions, with a teacher or without one."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class _Fleet(Protocol):
 
 
 class _ExploringFleet:
-    """Flies the teacher's actions but in a share of the steps, which is drawn for the mission; 1 without a teacher."""
+    """Flies the teacher's actions, and deviates in a share of steps drawn for the mission; 1 without a teacher."""
 
     def __init__(self, scenario: Scenario, mission: int, guide: Teacher | None) -> None:
         from simulator.policies.registry import policy_named
@@ -184,7 +184,7 @@ class _EdgeFleet:
         self._client = EdgeClient(url, timeout_s=_TIMEOUT_S)
         self._mission_id = f"explore-{mission}-{secrets.token_hex(4)}"
         self._pilot = EdgePilot(self._client, self._mission_id, scenario, mission, deadline_ms=_DEADLINE_MS)
-        # Where these change a decision, the states are not those that the LLM brings about.
+        # Planner and verifier would change the LLM's decisions, and so the states that they lead to.
         self._pilot.spec = self._pilot.spec.model_copy(update={"planner": "off", "verify": "off"})
         self._choices: dict[int, PilotChoice] = {}
 

@@ -95,7 +95,7 @@ class ClairvoyantTeacher:
             self._plan = None
 
     def learn(self, uav: int, step: int, failed: bool) -> None:
-        """Nothing: the clairvoyant knew it."""
+        """Nothing: the clairvoyant knows every outcome beforehand."""
 
     def _planned(self) -> NDArray[np.int64]:
         """The best flight ``(H, I, 2)`` found from the world's current state to its end, in wind for one step."""

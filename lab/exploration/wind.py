@@ -18,7 +18,7 @@ from simulator.world.environment import PipelineWorld
 
 # The largest distance between two compared places of one stretch of way, metres.
 _SPACING_M = 5.0
-# For each flight tried in wind: the steps of its plans (None: all remaining ones), and the deterministic seconds of
+# For each candidate flight in wind: the steps of its plans (None: all remaining ones), and the deterministic seconds of
 # each search. Neither is always better.
 _CHASES = ((10, 0.3), (None, 3.0))
 
@@ -33,15 +33,15 @@ def bound_in_wind(site: Site, seed: int, time_limit_s: float = 60.0) -> Plan:
         RuntimeError: the flight lost fewer packets than the bound.
     """
     best = least_loss(relaxed_problem(_reset(site, seed)), time_limit_s)
-    tried = [_chased(_reset(site, seed), steps, work) for steps, work in _CHASES]
-    flown, actions = min(((replay(site, seed, actions), actions) for actions in tried), key=itemgetter(0))
+    candidates = [_chased(_reset(site, seed), steps, work) for steps, work in _CHASES]
+    flown, actions = min(((replay(site, seed, actions), actions) for actions in candidates), key=itemgetter(0))
     if flown < best.lower_bound:
         raise RuntimeError(f"a flight of seed {seed} loses {flown} packets, the bound is {best.lower_bound}")
     return replace(best, actions=actions, lost_packets=flown)
 
 
 def problem_in_wind(world: PipelineWorld, steps: int | None = None) -> FleetProblem:
-    """:func:`true_problem` in the mean wind; gusts are left out, and :func:`velocities_towards` makes up for them."""
+    """:func:`true_problem` in the mean wind; without gusts, which :func:`velocities_towards` compensates."""
     left = world.scenario.steps - len(world.tally)
     return true_problem(world, steps, course(world, min(steps or left, left) * world.scenario.max_velocity + 1))
 
@@ -73,7 +73,7 @@ def course(world: PipelineWorld, sums: int) -> FloatArray:
 
 
 def targets(world: PipelineWorld, velocity: IntArray) -> FloatArray:
-    """The progress that a plan's velocities ``(I,)`` in the next step aim at, ``(I,)``, metres."""
+    """The target progress ``(I,)`` of a plan's velocities ``(I,)`` in the next step, metres."""
     return np.asarray(course(world, world.scenario.max_velocity + 1)[velocity, np.arange(len(velocity))])
 
 

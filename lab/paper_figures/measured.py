@@ -69,7 +69,7 @@ class Trips:
 
 
 def round_trips(scenario: Scenario, seeds: Sequence[int], llm: bool, console: Console) -> list[Trips]:
-    """Of missions over an edge in mode ``llm`` with the adapter that ships or, without an LLM, in mode ``value``."""
+    """The round trips of missions over an edge: in mode ``llm`` with the shipped adapter, or in mode ``value``."""
     found = []
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -82,24 +82,24 @@ def round_trips(scenario: Scenario, seeds: Sequence[int], llm: bool, console: Co
             pilot.spec = pilot.spec.model_validate({**pilot.spec.model_dump(), **mode})
             client.put_mission(f"trips-{seed}", pilot.spec)
             fly(Site(scenario), pilot, seed)
-            for uav, kept in sorted(pilot.kept.items()):
-                rows = np.array(kept)
+            for uav, trips in sorted(pilot.trips.items()):
+                rows = np.array(trips)
                 found.append(Trips(uav, rows[:, :2], rows[:, 2]))
     return found
 
 
 class _TimedPilot(EdgePilot):
-    """``kept``: by UAV, the place and the round trip of every query that the edge answered."""
+    """Records in ``trips`` the place and round trip of every answered query, by UAV."""
 
-    kept: dict[int, list[tuple[float, float, float]]]
+    trips: dict[int, list[tuple[float, float, float]]]
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
         """The edge's choice."""
         choice = super().decide(uav, observation, taken)
         if choice.exchange is not None:
             x, y = observation["position"].tolist()
-            self.kept = getattr(self, "kept", {})
-            self.kept.setdefault(uav, []).append((x, y, choice.exchange.rtt_ms))
+            self.trips = getattr(self, "trips", {})
+            self.trips.setdefault(uav, []).append((x, y, choice.exchange.rtt_ms))
         return choice
 
 
@@ -108,7 +108,7 @@ def spatial_share(trips: Sequence[Trips], centres: Sequence[Point], shifts: int 
 
     The place is the phase on the UAV's circle, as two harmonics of its own for each UAV; the times are logarithms less
     their mission's mean. Chance is the same times shifted along each mission by random numbers of steps, which keeps
-    how a time resembles the one before it.
+    the autocorrelation of the times.
     """
     rng = np.random.default_rng(0)
     fleet = len(centres)
@@ -127,6 +127,6 @@ def spatial_share(trips: Sequence[Trips], centres: Sequence[Point], shifts: int 
         y = np.concatenate(shifted)
         return float(((basis.T @ y) ** 2).sum() / (y**2).sum())
 
-    seen = share(times)
+    observed = share(times)
     chance = [share([np.roll(y, rng.integers(len(y))) for y in times]) for _ in range(shifts)]
-    return seen, (1 + sum(found >= seen for found in chance)) / (1 + shifts)
+    return observed, (1 + sum(found >= observed for found in chance)) / (1 + shifts)
