@@ -12,7 +12,7 @@ import httpx
 import pytest
 
 from tests.support.processes import output_until, run_here, started
-from tests.support.running_edges import Report, drained, first_event
+from tests.support.running_edges import Report, drain_output, first_event
 from tests.support.shared_store import Database
 from tests.support.waiting import PATIENCE_S, until
 
@@ -39,7 +39,7 @@ def serving(settings: dict[str, str], *args: str) -> Iterator[httpx.Client]:
     )
     with started("serve", "--port", "0", *args, **settings) as process:
         url = output_until(process, r"listening on (http://[\d.:]+)")[1]
-        drained(process)
+        drain_output(process)
         with httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
             until(lambda: client.get("/readyz").status_code == 200)
             assert client.post("/decide", json={"step": 0}).status_code == 401

@@ -22,7 +22,7 @@ from simulator.records.summary import Summary
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.plans.plan_folder import export_plans
 from simulator.sites.site import Site
-from tests.support.airframe import once
+from tests.support.airframe import without_repeats
 from tests.support.edge_stub import free_port
 from tests.support.processes import run, serving_edge, started
 from tests.support.pymavlink_peer import ARDUPILOT, PAUSE, PX4, SET_MODE, SPEED, PymavlinkPeer, pymavlink_peer
@@ -212,7 +212,7 @@ def check_wire(peers: list[PymavlinkPeer], decisions: list[Decision]) -> None:
         assert kinds <= {"COMMAND_LONG", "PING", "MISSION_REQUEST_LIST", "MISSION_REQUEST_INT", "MISSION_ACK"}
         commands: list[Any] = [m for _, m in peer.received if m.get_type() == "COMMAND_LONG"]
         assert {m.command for m in commands} <= HARMLESS
-        speeds = once([m.param2 for m in commands if m.command == SPEED])
+        speeds = without_repeats([m.param2 for m in commands if m.command == SPEED])
         own = [d for d in decisions if d.uav_id == uav]
         assert all(LEAST_SPEED_M_S <= speed <= 14 for speed in speeds) and len(speeds) <= 5 * len(own)
         assert all(int(m.param3) in (3, 4) for m in commands if m.command == SET_MODE)

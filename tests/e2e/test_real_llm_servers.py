@@ -25,11 +25,11 @@ from tests.support.processes import run_here
 from tests.support.real_llm_servers import (
     MASTER_KEY,
     Packages,
-    answers,
     forward_proxy,
     litellm,
     tls_front,
     transformers_serve,
+    wait_for_server,
 )
 from tests.support.stub_llm import wait_for
 from tests.support.waiting import until
@@ -93,9 +93,9 @@ def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Servers]:
         assert writing.wait() == 0
         transformers = stack.enter_context(transformers_serve(packages, model, folder))
         for url in (served, small, gemma):
-            answers(url.replace("/v1", "/health"))
-        answers(routed.replace("/v1", "/health/liveliness"), folder / "litellm.log")
-        answers(transformers.replace("/v1", "/health"), folder / "transformers.log")
+            wait_for_server(url.replace("/v1", "/health"))
+        wait_for_server(routed.replace("/v1", "/health/liveliness"), folder / "litellm.log")
+        wait_for_server(transformers.replace("/v1", "/health"), folder / "transformers.log")
         trusted = {"SSL_CERT_FILE": str(folder / "authority.pem")}
         # The edge and the simulator talk to each other without the proxy.
         proxies = {"HTTP_PROXY": proxy, "HTTPS_PROXY": proxy, "NO_PROXY": "127.0.0.1"}

@@ -229,7 +229,7 @@ def test_a_decision_in_flight_is_answered_before_the_edge_stops(report: Callable
     ):
         wait_for(client, "ready")
         waiting = pool.submit(client.post, "/decide", json=report(mission_id="default", deadline_ms=60_000))
-        until(lambda: gate.came)
+        until(lambda: gate.callers)
         process.send_signal(signal.SIGTERM)
         answer = waiting.result(timeout=PATIENCE_S)
         process.wait(PATIENCE_S)

@@ -13,7 +13,7 @@ import psycopg
 import pytest
 
 from tests.support.processes import output_until, started
-from tests.support.running_edges import Report, drained
+from tests.support.running_edges import Report, drain_output
 from tests.support.shared_store import Database
 from tests.support.waiting import PATIENCE_S, until
 
@@ -38,7 +38,7 @@ def serving(store: str, *way: str) -> Iterator[httpx.Client]:
     """A client of the ready edge, which is killed at the end with all its processes."""
     with started("serve", "--port", "0", *way, AICVDS_STORE=store, **SETTINGS) as process:
         url = output_until(process, r"listening on (http://[\d.:]+)")[1]
-        drained(process)
+        drain_output(process)
         with httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
             until(lambda: client.get("/readyz").status_code == 200)
             yield client

@@ -18,7 +18,7 @@ from tests.faults.fleet import Report
 from tests.faults.shared_fleet import LEASE_S, flying
 from tests.faults.table import Tables
 from tests.support.processes import output_until, run, started
-from tests.support.running_edges import drained
+from tests.support.running_edges import drain_output
 from tests.support.shared_store import DEADLINE_MS, Database
 from tests.support.waiting import PATIENCE_S, until
 
@@ -60,7 +60,7 @@ def ingress(database: Database, ray: str) -> Iterator[str]:
     """``aicvds serve --ray`` with two edges, ready; it must end when asked to."""
     with started(*command(ray), **settings(database)) as process:
         url = output_until(process, r"listening on (http://[\d.:]+)")[1]
-        drained(process)
+        drain_output(process)
         until(lambda: both_ready(url))
         yield url
         process.terminate()
@@ -136,7 +136,7 @@ def test_several_ingresses_use_the_same_edges_which_outlive_them(database: Datab
     with two_raylets() as (cluster, _):
         with started(*command(cluster.address), **settings(database)) as first:
             url = output_until(first, r"listening on (http://[\d.:]+)")[1]
-            drained(first)
+            drain_output(first)
             until(lambda: both_ready(url))
             edges = {edge.pid for edge in replicas(psutil.Process())}
             assert httpx.post(f"{url}/decide", json=report(step=0), timeout=PATIENCE_S).json()["stored"]

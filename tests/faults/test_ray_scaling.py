@@ -20,7 +20,7 @@ from tests.faults.shared_fleet import LEASE_S, flying
 from tests.faults.test_ray import command, ingress, replicas, settings, two_raylets
 from tests.support.processes import output_until, started
 from tests.support.running import serving
-from tests.support.running_edges import drained
+from tests.support.running_edges import drain_output
 from tests.support.shared_store import DEADLINE_MS, Database
 from tests.support.waiting import PATIENCE_S, until
 
@@ -125,7 +125,7 @@ def test_a_cluster_that_loses_its_head_node_loses_nothing_acknowledged(database:
         httpx.Client(timeout=PATIENCE_S) as client,
     ):
         client.base_url = httpx.URL(output_until(process, r"listening on (http://[\d.:]+)")[1])
-        drained(process)
+        drain_output(process)
         until(lambda: client.get("/readyz").status_code == 200)
         for name in NAMES:
             assert not decided(client, report(mission_id=name))

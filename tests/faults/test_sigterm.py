@@ -16,7 +16,7 @@ from tests.faults.fleet import Report
 from tests.faults.table import Tables
 from tests.support.processes import serving_edge
 from tests.support.running import listening
-from tests.support.stub_llm import misbehaving, saying, wait_for
+from tests.support.stub_llm import http_answer, misbehaving, wait_for
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(300)]
 
@@ -25,7 +25,7 @@ TIMES, UAVS, MOST_S = 6, 6, 10.0
 
 async def slowly(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     await asyncio.sleep(0.3)
-    await saying(b"200 OK", b'{"choices": [{"message": {"content": "0 7"}}]}')(reader, writer)
+    await http_answer(b"200 OK", b'{"choices": [{"message": {"content": "0 7"}}]}')(reader, writer)
 
 
 class Uav(threading.Thread):

@@ -17,7 +17,7 @@ from tests.faults.fleet import Report, ask, resident_mb
 from tests.faults.table import Tables
 from tests.support.processes import serving_edge
 from tests.support.running import Handler, listening
-from tests.support.stub_llm import FAULTS, bomb, misbehaving, saying, wait_for
+from tests.support.stub_llm import FAULTS, bomb, http_answer, misbehaving, wait_for
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(300)]
 
@@ -26,7 +26,7 @@ TITLE = "The LLM's server"
 
 
 def completion(text: str) -> Handler:
-    return saying(b"200 OK", json.dumps({"choices": [{"message": {"content": text}}]}).encode())
+    return http_answer(b"200 OK", json.dumps({"choices": [{"message": {"content": text}}]}).encode())
 
 
 async def a_byte_a_second(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -1,4 +1,4 @@
-"""A body that flies a mission's waypoints by the clock, whatever speaks for it on the wire."""
+"""A simulated airframe that flies a mission's waypoints by the clock; the MAVLink peers in the tests use it."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ HEIGHT_M = 100.0
 GROUND_M = 1850.0
 
 
-Told = TypeVar("Told")
+T = TypeVar("T")
 
 
-def once(commands: Iterable[Told]) -> list[Told]:
-    """The commands without repetitions: MAVSDK sends a command again until it is acknowledged."""
+def without_repeats(commands: Iterable[T]) -> list[T]:
+    """The commands without consecutive repetitions: MAVSDK repeats a command until it is acknowledged."""
     return [command for command, _ in groupby(commands)]
 
 
 @dataclass(frozen=True)
 class Item:
-    """A mission item as it is on the wire."""
+    """A mission item as MAVLink sends it."""
 
     command: int
     latitude: float
@@ -36,7 +36,7 @@ class Item:
 class Airframe:
     """Flies round its waypoints (command 16) and back to the first, at a speed that is set.
 
-    It computes on a sphere and with its own projection, and shares nothing with what it tests.
+    It computes on a sphere and with its own projection, and shares no code with the product.
 
     Attributes:
         speed: m/s, commanded.
@@ -67,7 +67,7 @@ class Airframe:
         self.ground_speed, self.top, self.accelerates = min(speed, top), top, accelerates
         self.paused = False
         self.drift_m = 0.0
-        # It climbs without a way forward, as ArduPilot does in mode AUTO.
+        # The height of a climb in place, as ArduPilot flies it in mode AUTO; None after it.
         self.climbs_m: float | None = None
         self.trace: list[tuple[float, float]] = []
         self._speedup, self._at_s = speedup, time.monotonic()
@@ -87,14 +87,14 @@ class Airframe:
 
     def _fly(self, seconds: float) -> None:
         moves = self.mode == "mission" and not self.paused and self.climbs_m is None
-        wanted = min(self.speed, self.top) if moves else 0.0
+        target = min(self.speed, self.top) if moves else 0.0
         before, most = self.ground_speed, self.accelerates * seconds if seconds else 0.0
-        self.ground_speed += min(max(wanted - before, -most), most)
+        self.ground_speed += min(max(target - before, -most), most)
         ramp_s = min(seconds, abs(self.ground_speed - before) / self.accelerates)
         self.flown_m += (before + self.ground_speed) / 2 * ramp_s + self.ground_speed * (seconds - ramp_s)
 
     def height_m(self) -> float:
-        """Above the take-off place."""
+        """The height above the take-off place."""
         return HEIGHT_M if self.climbs_m is None else self.climbs_m
 
     def _metres(self, latitude: float, longitude: float) -> tuple[float, float]:

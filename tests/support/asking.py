@@ -7,7 +7,7 @@ from typing import Any
 import httpx
 
 PATHS = ("/decide", "/decide/batch")
-# What a batch's UAVs have in common.
+# The fields that the UAVs of a batch share.
 _SHARED = ("mission_id", "step", "deadline_ms")
 
 

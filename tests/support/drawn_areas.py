@@ -1,4 +1,4 @@
-"""Areas of a ``world.geojson`` as RFC 7946 means them, by other arithmetic than the product's: in degrees."""
+"""Areas of a ``world.geojson`` by RFC 7946, computed in degrees, independently of the product."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _METRES_A_DEGREE = 111_300.0
 
 
 def breach_m(site: Site, features: list[Json], samples: int = 97) -> float:
-    """How far the UAVs' trajectories leave the drawn fences or enter the no_fly areas, metres; 0 where they do not."""
+    """The largest distance by which trajectories leave the fences or enter the no_fly areas, metres; 0 if none does."""
     assert site.frame is not None
     worst = 0.0
     for path in trajectories(site.scenario):
@@ -40,7 +40,7 @@ def _depth_m(feature: Json, longitude: float, latitude: float) -> float:
     if kind == "Point":
         return float(feature["properties"]["radius_m"] - _EARTH.inv(longitude, latitude, *drawn)[2])
     across = math.cos(math.radians(latitude))
-    # The place is the origin, so that the antimeridian may be anywhere.
+    # The place is the origin, so that areas may cross the antimeridian.
     ring = [(((x - longitude + 180) % 360 - 180) * across, y - latitude) for x, y in drawn[0]]
     inside, nearest = False, math.inf
     for (x1, y1), (x2, y2) in pairwise(ring):

@@ -39,10 +39,10 @@ LLM = Literal["loading", "ready", "unavailable", "off"]
 
 @dataclass
 class EdgeStub:
-    """``script`` has the behaviour for each of the next requests to /decide; afterwards it is ``otherwise``.
+    """``script`` has the behaviour for each of the next requests to /decide; the behaviour is ``otherwise`` after them.
 
-    Who is met with ``slow`` waits at the ``gate``, and with ``elsewhere`` is sent to the ``owner``. ``decides``,
-    ``feedbacks`` and ``missions`` are what arrived and was understood.
+    A request with the behaviour ``slow`` waits at the ``gate``; one with ``elsewhere`` gets the ``owner``'s address.
+    ``decides``, ``feedbacks`` and ``missions`` have the valid requests.
     """
 
     url: str = ""
@@ -137,11 +137,11 @@ class EdgeStub:
         return Response(self._status(mission_id).model_dump_json())
 
     async def guide(self, request: Request) -> Response:
-        """POST /missions/{mission_id}/guidance, of a new note."""
+        """POST /missions/{mission_id}/guidance with a new note."""
         mission_id = request.path_params["mission_id"]
-        given = GuidanceAnswer.model_validate_json(await request.body())
-        self.notes[mission_id] = given.note or ""
-        return Response(GuidanceStatus(mission_id=mission_id, status="compiling", note=given.note).model_dump_json())
+        answer = GuidanceAnswer.model_validate_json(await request.body())
+        self.notes[mission_id] = answer.note or ""
+        return Response(GuidanceStatus(mission_id=mission_id, status="compiling", note=answer.note).model_dump_json())
 
     def _status(self, mission_id: str) -> MissionStatus:
         spec = self.missions[mission_id]
@@ -220,7 +220,7 @@ def stub_edge() -> Iterator[EdgeStub]:
 
 
 def free_port() -> int:
-    """A port of the loopback that was free just now."""
+    """A free port of the loopback interface."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -228,7 +228,7 @@ def free_port() -> int:
 
 @contextmanager
 def stub_edge_at(port: int) -> Iterator[EdgeStub]:
-    """A new stub without missions on a given port, such as that of a stub before."""
+    """A new stub without missions on a given port, such as that of an earlier stub."""
     stub = EdgeStub(url=f"http://127.0.0.1:{port}")
     with serving(stub.app(), port):
         yield stub

@@ -1,4 +1,4 @@
-"""A report's columns of two sensors, of which one was never heard."""
+"""The sensor columns of a report with two sensors, one of them never heard."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A llama.cpp server in a process of its own: ``python -m tests.support.llama_server PORT NAME GGUF SLOTS [ADAPTER]``.
 
-It is what ``llama-server --port PORT --alias NAME --model GGUF --parallel SLOTS --lora ADAPTER`` is, out of the package
-that the edge embeds, with one thread.
+It equals ``llama-server --port PORT --alias NAME --model GGUF --parallel SLOTS --lora ADAPTER`` with one thread, from
+the package that the edge embeds.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-# Tokens of each slot.
+# The tokens of each slot.
 _CONTEXT = 4096
 
 
@@ -28,7 +28,7 @@ def serve(port: int, name: str, gguf: str, slots: int, adapter: str | None = Non
     params.cpuparams.n_threads = params.cpuparams_batch.n_threads = 1
     if adapter is not None:
         params.lora_adapters = [xllamacpp.CommonAdapterLoraInfo(adapter, 1.0)]
-    # What is in no slot is read again.
+    # A prompt that no slot has is read again.
     params.cache_ram_mib = 0
     params.verbosity = 1
     server = xllamacpp.Server(params)

@@ -15,7 +15,7 @@ def dev_eui(number: int) -> str:
 
 
 def rfc3339(at: datetime) -> str:
-    """With nanoseconds, as Go and Rust write it."""
+    """The time with nanoseconds, as Go and Rust write it."""
     return at.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%f") + "123Z"
 
 

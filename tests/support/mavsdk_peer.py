@@ -24,7 +24,7 @@ class MavsdkPeer:
     """A vehicle that sends to a UDP port of loopback. MAVSDK's action server denies mode hold, whatever it receives.
 
     Attributes:
-        received: names and fields of all messages that came, without heartbeats.
+        received: names and fields of all received messages, without heartbeats.
         uploaded: the items of the mission that a ground station sent.
     """
 
@@ -54,13 +54,13 @@ class MavsdkPeer:
         self._thread.start()
 
     def close(self) -> None:
-        """Fall silent."""
+        """Stop sending."""
         self._ends.set()
         self._thread.join()
         self._mavsdk.destroy()
 
     def commands(self) -> list[tuple[int, float]]:
-        """The commands that fly it: number, and speed or PX4 sub-mode."""
+        """The received flight commands: number, and speed or PX4 sub-mode."""
         commands = [fields for name, fields in self.received if name in ("COMMAND_LONG", "COMMAND_INT")]
         return [
             (fields["command"], fields["param2"] if fields["command"] == SPEED else fields["param3"])

@@ -16,7 +16,7 @@ PAPER = SCENARIOS["paper"]
 
 
 def mission(spec: MissionSpec | None = None, **settings: Any) -> Mission:
-    """One that decides from what its UAVs report, so that a test need not tell it before; with the paper's features."""
+    """A mission with the paper's features that decides from its UAVs' own reports, without earlier observations."""
     spec = spec or MissionSpec()
     as_written = {"belief": "reported", "features": spec.features or "paper"}
     return Mission("test", spec.model_copy(update=as_written), Settings(**{"mode": "value", **settings}))
@@ -32,7 +32,7 @@ def uav(
     queue: list[float | None] | None = None,
     last_seen: list[int | None] | None = None,
 ) -> UavState:
-    """A UAV over the area's centre that hears sensors on a line to the east, 100 m apart, unless told otherwise."""
+    """A UAV over the area's centre that hears sensors on a line to the east, 100 m apart, by default."""
     queue = queue if queue is not None else [10.0 * (i + 1) for i in range(6)]
     n = len(queue)
     seen = last_seen if last_seen is not None else [None if q is None else step for q in queue]
@@ -53,7 +53,7 @@ def attended(mission: Mission, state: UavState, step: int = 0) -> AttendedState:
 
 
 def written_rows(state: State) -> list[str]:
-    """The line of every sensor; numbers that a beacon must say are unknown where none was heard."""
+    """The prompt line of every sensor; without a beacon its reported numbers are unknown."""
     names, numbers = whole_numbers(state)
     return [
         row({n: str(v) if heard or n in ALWAYS_KNOWN else UNKNOWN for n, v in zip(names, values, strict=True)})

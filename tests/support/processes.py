@@ -26,12 +26,12 @@ LAB = (sys.executable, "-m", "lab")
 
 
 def run(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
-    """One command of ``aicvds`` to its end."""
+    """Run one command of ``aicvds`` to its end."""
     return _run([str(AICVDS), *args], env)
 
 
 def run_lab(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
-    """One command of ``python -m lab`` to its end."""
+    """Run one command of ``python -m lab`` to its end."""
     return _run([*LAB, *args], env)
 
 
@@ -96,6 +96,6 @@ def output_until(process: subprocess.Popen[str], pattern: str) -> re.Match[str]:
 
 @contextmanager
 def serving_edge(port: str = "0", **env: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """``aicvds serve`` on a free port unless told, with a far deadline unless told; yields its URL and process."""
+    """``aicvds serve``, by default on a free port and with a long deadline; yields its URL and process."""
     with started("serve", "--port", port, **{"AICVDS_DEADLINE_MS": "60000", **env}) as process:
         yield output_until(process, r"listening on (http://[\d.:]+)")[1], process

@@ -1,6 +1,6 @@
 """A MAVLink peer made with pymavlink alone: an implementation of the protocol that shares nothing with MAVSDK.
 
-As an ArduPilot it behaves as a real ArduCopter was seen to (../shared/REALITY.md, table B; by row), and as PX4 does
+As an ArduPilot it behaves as observed with a real ArduCopter (../shared/REALITY.md, table B; by row), and as PX4 does
 where that differs.
 """
 
@@ -31,7 +31,7 @@ AUTO, SUB_MODES = 4, {"hold": 3, "mission": 4, "return": 5, "land": 6}
 COPTER_MODES = {"hold": 17, "mission": 3, "return": 6, "land": 9}
 # The speed of a mission that has just become active, m/s, and PX4's delay until then.
 DEFAULT_SPEED, ACTIVATES_S = 5.0, 0.3
-# A ground station's system ID, the only one beside its own that an ArduPilot with MAV_OPTIONS obeys.
+# A ground station's system ID: an ArduPilot with MAV_OPTIONS obeys only this one and its own.
 GROUND_STATION = 255
 
 
@@ -39,17 +39,17 @@ class PymavlinkPeer:
     """A vehicle that sends to a UDP port of loopback.
 
     Attributes:
-        streams: the messages that it sends unasked or was asked for. An ArduPilot's rates are 0 until
+        streams: the messages that it sends by default or on request. An ArduPilot's rates are 0 until
             MAV_CMD_SET_MESSAGE_INTERVAL (row 1; GCS_MAVLink_Parameters; MAVSDK-Python 637).
         obeys_requests, answers_requests: whether it obeys a request for a stream, and acknowledges it.
-        received: all messages that came, without heartbeats, with the time.
+        received: all received messages without heartbeats, each with its time.
         silent: it sends nothing while this is set, and goes on flying and listening.
         autopilot: of its heartbeats, a MAV_AUTOPILOT.
         restarts: MIS_RESTART, with which mode AUTO begins the mission again (row 5).
         enforces_ids: of MAV_OPTIONS, whether it obeys its own system ID and a ground station's alone (row 7).
         answers_pauses: whether its answer to MAV_CMD_DO_PAUSE_CONTINUE arrives; it obeys all the same.
         pauses: whether it knows MAV_CMD_DO_PAUSE_CONTINUE, as ArduCopter does and ArduPlane and PX4 do not.
-        above_home_m: its heights are above a home that is so much lower than its take-off place (row 9).
+        above_home_m: height of its take-off place above its home, to which its heights refer (row 9).
     """
 
     def __init__(
@@ -76,13 +76,13 @@ class PymavlinkPeer:
         self._thread.start()
 
     def close(self) -> None:
-        """Fall silent."""
+        """Stop sending."""
         self._ends.set()
         self._thread.join()
         self._link.close()
 
     def commands(self) -> list[tuple[float, Any]]:
-        """The commands that fly it, with the time."""
+        """The received flight commands, each with its time."""
         flies = (SPEED, SET_MODE, PAUSE, START)
         return [(at, m) for at, m in self.received if m.get_type() == "COMMAND_LONG" and m.command in flies]
 
@@ -104,7 +104,7 @@ class PymavlinkPeer:
             try:
                 message = self._link.recv_msg()
             except ConnectionError:
-                # Nobody listens on the other side.
+                # No socket listens on the other side.
                 return
             if message is None:
                 return

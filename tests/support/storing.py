@@ -1,4 +1,4 @@
-"""A store for edges whose tests are not about stores: quickly made, and written without a process beside."""
+"""A fast store for edges whose tests are not about stores, without a writing process."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from service.storage.store import Store
 
 
 def empty_store(path: Path) -> Path:
-    """Make an empty SQLite store there, unless there is one: a copy of it needs none of alembic's work."""
+    """Create an empty SQLite store, unless there is one; it is a copy, which needs no migrations."""
     if not path.exists():
         path.write_bytes(_empty())
     return path
@@ -51,10 +51,10 @@ class WriterHere:
         self._statements, self._database = statements, Database(path, epoch, {})
 
     def write(self, changes: Sequence[Change], done: Done) -> None:
-        """As ``Writer`` says."""
+        """See ``Writer``."""
         failed = self._database.commit(msgpack.unpackb(msgpack.packb(self._statements.of(changes))))
         asyncio.get_running_loop().call_soon(done, None if failed is None else WriteFailed(*failed))
 
     def close(self) -> None:
-        """As ``Writer`` says."""
+        """See ``Writer``."""
         self._database.close()

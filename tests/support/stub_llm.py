@@ -1,4 +1,4 @@
-"""LLM servers for tests: one that answers as it is told, and raw ones that misbehave in every way that one can."""
+"""LLM servers for tests: one with given answers, and raw ones with all kinds of faults."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from tests.support.running import Handler
 from tests.support.waiting import Gate, until
 
 PROBE = "7301"
-# What mode `llm` asks before there is anything to decide.
+# The warm-up query of mode `llm`.
 FIRST = "UAV at 500,500\n0,50,50,-90,100,1,60,40\n"
 
 
 class StubLlm:
-    """An OpenAI-compatible server that obeys a grammar and keeps what it was asked; subclasses say what it answers."""
+    """An OpenAI-compatible server that obeys a grammar and records its requests; subclasses define its answers."""
 
     def __init__(self, answer: str = "0 7") -> None:
         self.answer = answer
@@ -39,25 +39,25 @@ class StubLlm:
         return await self.respond(body, body["messages"][-1]["content"] == "Say hello.")
 
     async def respond(self, body: dict[str, Any], probed: bool) -> Response:
-        """The answer to a chat completion; ``probed`` when the edge looks whether the grammar is obeyed."""
-        return said(f"{PROBE} 0" if probed else self.answer)
+        """The answer to a chat completion; ``probed`` for the edge's test whether the server obeys a grammar."""
+        return chat_completion(f"{PROBE} 0" if probed else self.answer)
 
 
-def said(text: str, usage: dict[str, Any] | None = None, **choice: Any) -> Response:
+def chat_completion(text: str, usage: dict[str, Any] | None = None, **choice: Any) -> Response:
     """A chat completion with that text."""
     body: dict[str, Any] = {"choices": [{"message": {"content": text}, **choice}]}
     return JSONResponse(body if usage is None else {**body, "usage": usage})
 
 
 def wait_for(client: httpx.Client, llm: str) -> dict[str, Any]:
-    """What the edge says of itself, once that is where its LLM stands."""
+    """The edge's readiness, once its LLM has the given state."""
     ready: dict[str, Any] = {}
 
-    def there() -> bool:
+    def reached() -> bool:
         ready.update(client.get("/readyz").json())
         return bool(ready["llm"] == llm)
 
-    until(there, lambda: f"the LLM is to be {llm}: {ready}")
+    until(reached, lambda: f"the LLM is to be {llm}: {ready}")
     return ready
 
 
@@ -69,21 +69,21 @@ async def _head(reader: asyncio.StreamReader) -> dict[str, Any]:
 
 
 def misbehaving(fault: Handler, probes: Gate | None = None) -> Handler:
-    """A server that passes the probe, so that the edge trusts it, and then does what ``fault`` does.
+    """A server that passes the probe, so that the edge uses it, and handles later requests by ``fault``.
 
-    Where there is a gate for ``probes``, they are answered behind it.
+    With a gate for ``probes``, it answers them once that is open.
     """
 
     async def handler(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while True:
             body = await _head(reader)
-            asked = body.get("messages", [{}])[-1].get("content", "")
-            if body and asked not in ("Say hello.", FIRST) and "N/A" not in asked:
+            content = body.get("messages", [{}])[-1].get("content", "")
+            if body and content not in ("Say hello.", FIRST) and "N/A" not in content:
                 await fault(reader, writer)
                 return
-            if asked == "Say hello." and probes is not None:
+            if content == "Say hello." and probes is not None:
                 await probes.passed()
-            text = f"{PROBE} 0" if asked == "Say hello." else "0 0"
+            text = f"{PROBE} 0" if content == "Say hello." else "0 0"
             answer = json.dumps({"choices": [{"message": {"content": text}}], "data": [{"id": "stub-1"}]}).encode()
             writer.write(b"HTTP/1.1 200 OK\r\ncontent-length: %d\r\n\r\n%s" % (len(answer), answer))
             await writer.drain()
@@ -114,8 +114,8 @@ async def endless(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) ->
         await writer.drain()
 
 
-def pouring(head: bytes, more: bytes) -> Handler:
-    """What is no body, without end."""
+def endless_bytes(head: bytes, more: bytes) -> Handler:
+    """Answer with ``head``, then repeat ``more`` without end."""
 
     async def fault(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(head)
@@ -126,7 +126,7 @@ def pouring(head: bytes, more: bytes) -> Handler:
     return fault
 
 
-def saying(status: bytes, body: bytes) -> Handler:
+def http_answer(status: bytes, body: bytes) -> Handler:
     async def fault(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(b"HTTP/1.1 %s\r\ncontent-length: %d\r\nconnection: close\r\n\r\n%s" % (status, len(body), body))
         await writer.drain()
@@ -151,26 +151,29 @@ FAULTS: dict[str, tuple[Handler, str]] = {
     "dripping": (dripping, "llm_timeout"),
     "resetting": (resetting, "llm_error"),
     "endless": (endless, "llm_error"),
-    "429": (saying(b"429 Too Many Requests", b"{}"), "llm_status"),
-    "500": (saying(b"500 Oops", b"oops"), "llm_status"),
-    "redirect": (saying(b"302 Found", b""), "llm_status"),
-    "html": (saying(b"200 OK", b"<html>hello</html>"), "llm_error"),
-    "truncated": (saying(b"200 OK", b'{"choices": [{"mess'), "llm_error"),
-    "empty object": (saying(b"200 OK", b"{}"), "llm_error"),
-    "a list": (saying(b"200 OK", b"[1]"), "llm_error"),
-    "no text": (saying(b"200 OK", b'{"choices": [{"message": {"content": null}}]}'), "llm_error"),
+    "429": (http_answer(b"429 Too Many Requests", b"{}"), "llm_status"),
+    "500": (http_answer(b"500 Oops", b"oops"), "llm_status"),
+    "redirect": (http_answer(b"302 Found", b""), "llm_status"),
+    "html": (http_answer(b"200 OK", b"<html>hello</html>"), "llm_error"),
+    "truncated": (http_answer(b"200 OK", b'{"choices": [{"mess'), "llm_error"),
+    "empty object": (http_answer(b"200 OK", b"{}"), "llm_error"),
+    "a list": (http_answer(b"200 OK", b"[1]"), "llm_error"),
+    "no text": (http_answer(b"200 OK", b'{"choices": [{"message": {"content": null}}]}'), "llm_error"),
     "compressed": (_compressed, "llm_error"),
-    "not http": (saying(b"", b"\x00\x01"), "llm_error"),
+    "not http": (http_answer(b"", b"\x00\x01"), "llm_error"),
 }
 
 _PROCESSING = b"HTTP/1.1 102 Processing\r\n\r\n" * 5000
 
-# What no body's bound ends.
+# Endless answers that a bound on the body does not end.
 FLOODS: dict[str, tuple[Handler, str]] = {
-    "endless 102": (pouring(b"", _PROCESSING), "llm_error"),
+    "endless 102": (endless_bytes(b"", _PROCESSING), "llm_error"),
     "endless trailers": (
-        pouring(b"HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n0\r\n", b"x: y\r\n" * 5000),
+        endless_bytes(b"HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n0\r\n", b"x: y\r\n" * 5000),
         "llm_error",
     ),
-    "endless after its answer": (pouring(b"HTTP/1.1 200 OK\r\ncontent-length: 2\r\n\r\n{}", _PROCESSING), "llm_error"),
+    "endless after its answer": (
+        endless_bytes(b"HTTP/1.1 200 OK\r\ncontent-length: 2\r\n\r\n{}", _PROCESSING),
+        "llm_error",
+    ),
 }

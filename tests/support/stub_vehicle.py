@@ -1,4 +1,4 @@
-"""A vehicle and a clock in simulated time, for what needs no wire."""
+"""A vehicle and a clock in simulated time, for tests without MAVLink."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from simulator.sites.site import Site
 
 
 class SimulatedClock(MissionClock):
-    """Moves only where it is waited for."""
+    """A clock that advances only in ``until``."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
@@ -32,10 +32,10 @@ class StubVehicle:
 
     Attributes:
         commands: every command.
-        lands_at_s, flies_on_at_s: from the first to the second time it lands.
-        top: its highest ground speed, m/s, whatever it acknowledges.
-        shift_m: how far north of its path it reports itself.
-        battery_percent: as it reports.
+        lands_at_s, flies_on_at_s: the start and the end of its landing.
+        top: its highest ground speed, m/s, even if it acknowledges a higher one.
+        shift_m: the northward error of its reported position.
+        battery_percent: the battery level that it reports.
     """
 
     def __init__(self, site: Site, uav: int, clock: SimulatedClock, wind: float = 1.0) -> None:
@@ -51,7 +51,7 @@ class StubVehicle:
         self._speed, self._at_s = 5.0, clock.now()
 
     async def state(self) -> VehicleState:
-        """Now."""
+        """The current state."""
         self._advance()
         assert self._site.frame is not None
         x, y = self._path.at(self.flown_m).tolist()
@@ -63,21 +63,21 @@ class StubVehicle:
         return replace(state, mode="landing") if landing else state
 
     async def mission(self) -> list[MissionItem]:
-        """None."""
+        """No items."""
         return []
 
     async def set_speed(self, speed_m_s: float) -> None:
-        """Fly at it."""
+        """Set the speed."""
         self._obey(speed_m_s)
         self._speed = speed_m_s
 
     async def hold(self) -> None:
-        """Stay."""
+        """Hold the position."""
         self._obey("hold")
         self.mode = "hold"
 
     async def resume(self) -> None:
-        """Go on."""
+        """Resume the mission."""
         self._obey("resume")
         self.mode = "mission"
 

@@ -1,4 +1,4 @@
-"""Flights without a drawn report, for tests that do not look at it: to draw one takes seconds."""
+"""Flights without a drawn report, for tests that do not check it: drawing one takes seconds."""
 
 from __future__ import annotations
 

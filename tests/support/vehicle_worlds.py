@@ -1,4 +1,4 @@
-"""World folders to be flown over MAVLink, and the missions of their trajectories."""
+"""World folders for flights over MAVLink, and the missions of their trajectories."""
 
 from __future__ import annotations
 
@@ -57,6 +57,6 @@ def pipeline_folder(
 
 
 def starts_m(folder: Path, seed: int) -> list[float]:
-    """Where `aicvds simulate` starts the UAVs of a world's folder, metres along their trajectories."""
+    """The starts of the UAVs in `aicvds simulate` of a world's folder, metres along their trajectories."""
     fleet = Fleet.draw(site_from_folder(folder).scenario, Streams.of(np.random.SeedSequence(seed)).angles)
     return [float(start) for start in fleet.start_m]

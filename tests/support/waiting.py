@@ -1,4 +1,4 @@
-"""Waiting without a clock: for a condition, and at gates that a test opens."""
+"""Waiting for a condition, and at gates that a test opens."""
 
 from __future__ import annotations
 
@@ -11,37 +11,37 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-# Far beyond the needs of a busy machine: only a failing test waits so long.
+# Long enough for a busy machine: only a failing test waits so long.
 PATIENCE_S = 120.0
 
 
-def until(found: Callable[[], T], told: Callable[[], object] = lambda: "") -> T:
-    """Wait until ``found`` returns a true value, and return it; ``told`` describes the state if it never does."""
+def until(condition: Callable[[], T], describe: Callable[[], object] = lambda: "") -> T:
+    """Wait until ``condition`` returns a true value, and return it; ``describe`` gives the state after a timeout."""
     ends = time.monotonic() + PATIENCE_S
-    while not (seen := found()):
-        assert time.monotonic() < ends, f"it never came true: {told()}"
+    while not (value := condition()):
+        assert time.monotonic() < ends, f"it never came true: {describe()}"
         time.sleep(0.005)
-    return seen
+    return value
 
 
-async def soon(found: Callable[[], T]) -> T:
+async def soon(condition: Callable[[], T]) -> T:
     """As :func:`until`, for a condition on this event loop."""
     async with asyncio.timeout(PATIENCE_S):
-        while not (seen := found()):
+        while not (value := condition()):
             await asyncio.sleep(0.001)
-    return seen
+    return value
 
 
 class Gate:
     """Holds every caller until it is opened, from any thread. The end of a ``with`` opens it.
 
-    ``came`` counts the callers, whether they have passed or not.
+    ``callers`` counts the callers, whether they have passed or not.
     """
 
     def __init__(self, *, opened: bool = False) -> None:
         self._opened = threading.Event()
         self._counting = threading.Lock()
-        self.came = 0
+        self.callers = 0
         if opened:
             self._opened.set()
 
@@ -55,18 +55,18 @@ class Gate:
 
     def wait(self) -> None:
         """Wait for the gate in a thread."""
-        self._come()
+        self._count_caller()
         assert self._opened.wait(PATIENCE_S)
 
     async def passed(self) -> None:
         """Wait for the gate on an event loop."""
-        self._come()
+        self._count_caller()
         while not self._opened.is_set():
             await asyncio.sleep(0.002)
 
-    def _come(self) -> None:
+    def _count_caller(self) -> None:
         with self._counting:
-            self.came += 1
+            self.callers += 1
 
     def __enter__(self) -> Gate:
         return self

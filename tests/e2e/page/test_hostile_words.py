@@ -18,7 +18,7 @@ from service.config.settings import Settings
 from simulator.commands import compare, simulate
 from tests.e2e.page.conftest import Open, Report
 from tests.support.running import serving
-from tests.support.stub_llm import PROBE, StubLlm, said, wait_for
+from tests.support.stub_llm import PROBE, StubLlm, chat_completion, wait_for
 from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.needs("chromium")
@@ -44,7 +44,9 @@ class Hostile(StubLlm):
         return {"data": [{"id": MODEL}]}
 
     async def respond(self, body: dict[str, Any], probed: bool) -> Response:
-        return said(f"{PROBE} 0" if probed else self.answer if len(self.bodies) % 3 else SCRIPT + ENDS + LONG)
+        return chat_completion(
+            f"{PROBE} 0" if probed else self.answer if len(self.bodies) % 3 else SCRIPT + ENDS + LONG
+        )
 
 
 @contextmanager

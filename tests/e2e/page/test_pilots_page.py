@@ -18,7 +18,7 @@ from simulator.sites.files.world_folder import site_from_folder
 from simulator.world.observation import decide_request
 from tests.e2e.page.conftest import Open, violations
 from tests.support.running import serving
-from tests.support.stub_llm import StubLlm, said, wait_for
+from tests.support.stub_llm import StubLlm, chat_completion, wait_for
 from tests.support.waiting import PATIENCE_S
 from tests.support.world_folders import EXAMPLE
 
@@ -164,7 +164,9 @@ class Letters(StubLlm):
     async def respond(self, body: dict[str, Any], probed: bool) -> Response:
         likeliest = [{"token": "A", "logprob": -0.1}, {"token": "B", "logprob": -2.4}]
         usage = {"prompt_tokens": 300, "completion_tokens": 1}
-        return said("A", usage, logprobs={"content": [{"token": "A", "logprob": -0.1, "top_logprobs": likeliest}]})
+        return chat_completion(
+            "A", usage, logprobs={"content": [{"token": "A", "logprob": -0.1, "top_logprobs": likeliest}]}
+        )
 
 
 def test_a_decision_shows_how_the_letters_probabilities_fell(visit: Open) -> None:

@@ -18,9 +18,9 @@ from field.vehicles.mavlink_vehicle import mavlink_vehicle
 from simulator.records.summary import Summary
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.plans.mission_path import MissionItem
-from tests.support.airframe import Item, once
+from tests.support.airframe import Item, without_repeats
 from tests.support.edge_stub import free_port
-from tests.support.flights import arguments, becomes
+from tests.support.flights import arguments, wait_for_reason
 from tests.support.processes import output_until, started
 from tests.support.pymavlink_peer import ARDUPILOT, PAUSE, POSITION, PX4, SPEED, pymavlink_peer
 from tests.support.waiting import PATIENCE_S, Striding, soon
@@ -37,14 +37,14 @@ async def test_an_ardupilot_is_asked_for_its_position_and_again_after_a_gap(
         peer.answers_requests = answers
         async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
             uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE))
-            await becomes(uav, None)
+            await wait_for_reason(uav, None)
             # It has started anew, and sends heartbeats alone until it is asked again.
             peer.streams.clear()
             peer.obeys_requests = False
-            await becomes(uav, "its heartbeat arrives, but no position, which was asked for")
+            await wait_for_reason(uav, "its heartbeat arrives, but no position, which was asked for")
             assert not uav.landed
             peer.obeys_requests = True
-            await becomes(uav, None)
+            await wait_for_reason(uav, None)
 
 
 async def test_an_autopilot_that_streams_its_position_is_not_asked_for_it(
@@ -59,7 +59,7 @@ async def test_an_autopilot_that_streams_its_position_is_not_asked_for_it(
             return [m.param1 for m in found if m.command == SET_MESSAGE_INTERVAL]
 
         async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
-            await becomes(FieldUav(0, vehicle, site_from_folder(EXAMPLE)), None)
+            await wait_for_reason(FieldUav(0, vehicle, site_from_folder(EXAMPLE)), None)
             # It sends no battery, and is asked for that after a second; for a position it would be asked before.
             await soon(lambda: BATTERY_STATUS in asked())
             assert POSITION not in asked()
@@ -70,21 +70,21 @@ async def test_decisions_begin_at_the_height_of_the_path_or_on_the_way(missions:
         peer.airframe.climbs_m = 0.0
         async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
             uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE), height_m=100.0)
-            await becomes(uav, "it is on the ground")
+            await wait_for_reason(uav, "it is on the ground")
             peer.airframe.climbs_m = 6.0
-            await becomes(uav, "it climbs to 100 m")
+            await wait_for_reason(uav, "it climbs to 100 m")
             with pytest.raises(VehicleError, match="does not fly its mission: it climbs"):
                 await wait_for_missions([uav], wait_s=0.3)
             peer.airframe.climbs_m = 92.0
-            await becomes(uav, None)
+            await wait_for_reason(uav, None)
             # A descent on the way is none to the ground.
             peer.airframe.climbs_m = 30.0
             await asyncio.sleep(0.2)
-            await becomes(uav, None)
+            await wait_for_reason(uav, None)
             low = FieldUav(0, vehicle, site_from_folder(EXAMPLE), height_m=math.inf)
-            await becomes(low, "it climbs")
+            await wait_for_reason(low, "it climbs")
             peer.airframe.climbs_m, peer.airframe.speed = None, 50.0
-            await becomes(low, None)
+            await wait_for_reason(low, None)
 
 
 async def test_a_landed_state_says_who_is_in_the_air_and_a_height_only_where_there_is_none(
@@ -95,16 +95,16 @@ async def test_a_landed_state_says_who_is_in_the_air_and_a_height_only_where_the
         peer.above_home_m = -99.0
         async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
             uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE), height_m=0.0)
-            await becomes(uav, None)
+            await wait_for_reason(uav, None)
             peer.airframe.climbs_m, peer.above_home_m = 0.0, 60.0
-            await becomes(uav, "it is on the ground")
+            await wait_for_reason(uav, "it is on the ground")
     with pymavlink_peer(missions[0], port, autopilot=ARDUPILOT) as peer:
         peer.says_landed, peer.airframe.climbs_m = False, 3.0
         async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
             uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE), height_m=0.0)
-            await becomes(uav, "it is on the ground")
+            await wait_for_reason(uav, "it is on the ground")
             peer.airframe.climbs_m = None
-            await becomes(uav, None)
+            await wait_for_reason(uav, None)
 
 
 async def test_an_armed_vehicle_is_never_said_to_be_unarmed(missions: list[list[Item]], port: int) -> None:
@@ -130,7 +130,7 @@ async def test_an_arducopter_waits_in_its_mission_and_goes_on_where_it_was(
         peer.restarts = restarts
         async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
             uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE))
-            await becomes(uav, None)
+            await wait_for_reason(uav, None)
             await uav.command(0)
             assert (peer.airframe.paused, peer.airframe.mode) == (True, "mission")
             await asyncio.sleep(MODE_LAG_S)
@@ -139,7 +139,9 @@ async def test_an_arducopter_waits_in_its_mission_and_goes_on_where_it_was(
             await uav.command(0)
             await uav.command(9)
             assert not peer.airframe.paused and not uav.waits and peer.airframe.flown_m >= 900.0
-            told = once((m.command, m.param2 if m.command == SPEED else m.param1) for _, m in peer.commands())
+            told = without_repeats(
+                (m.command, m.param2 if m.command == SPEED else m.param1) for _, m in peer.commands()
+            )
             assert told == [(PAUSE, 0.0), (PAUSE, 1.0), (SPEED, pytest.approx(9.0, abs=0.2))]
             # It is taking off again, where ArduCopter refuses a pause.
             peer.airframe.climbs_m = 50.0
@@ -159,7 +161,7 @@ async def test_an_ardupilot_without_a_pause_is_sent_to_mode_hold_only_if_it_resu
             assert peer.airframe.mode == "mission"
             peer.restarts = 0
             uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE))
-            await becomes(uav, None)
+            await wait_for_reason(uav, None)
             await uav.command(0)
             assert peer.airframe.mode == "hold"
             await asyncio.sleep(MODE_LAG_S)
@@ -190,7 +192,7 @@ async def test_the_top_speed_of_an_airframe_is_seen_though_every_speed_is_acknow
     with pymavlink_peer(missions[0], port, autopilot=ARDUPILOT, speedup=4.0, top=11.0, accelerates=2.5) as peer:
         async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
             uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE))
-            await becomes(uav, None)
+            await wait_for_reason(uav, None)
             await uav.command(9)
             for _ in range(12):
                 await asyncio.sleep(0.25)

@@ -19,7 +19,7 @@ from simulator.sites.plans.mission_path import DELAY, TAKEOFF, WAYPOINT, Mission
 from tests.integration.field.vehicles.test_field_flight import Counting, Trial, nobody
 from tests.support.airframe import Item
 from tests.support.edge_stub import stub_edge
-from tests.support.flights import becomes
+from tests.support.flights import wait_for_reason
 from tests.support.pymavlink_peer import ARDUPILOT, pymavlink_peer
 from tests.support.stub_vehicle import StubVehicle
 from tests.support.waiting import PATIENCE_S, soon
@@ -32,7 +32,7 @@ async def test_a_pause_whose_answer_is_lost_is_ended_all_the_same(missions: list
     with pymavlink_peer(missions[0], port, autopilot=ARDUPILOT, start_m=900.0) as peer:
         async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
             uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE))
-            await becomes(uav, None)
+            await wait_for_reason(uav, None)
             peer.answers_pauses = False
             with pytest.raises(Unanswered, match="did not hold: TIMEOUT"):
                 await uav.command(0)
@@ -45,7 +45,7 @@ async def test_a_pause_whose_answer_is_lost_is_ended_all_the_same(missions: list
 async def test_an_ardupilot_is_asked_for_its_battery(missions: list[list[Item]], port: int) -> None:
     with pymavlink_peer(missions[0], port, autopilot=ARDUPILOT) as peer:
         async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
-            await becomes(FieldUav(0, vehicle, site_from_folder(EXAMPLE)), None)
+            await wait_for_reason(FieldUav(0, vehicle, site_from_folder(EXAMPLE)), None)
             async with asyncio.timeout(PATIENCE_S):
                 while BATTERY_STATUS not in peer.streams:
                     await asyncio.sleep(0.05)

@@ -23,9 +23,9 @@ from simulator.records.mission_logs import read_decisions
 from simulator.records.summary import Summary
 from simulator.sites.files.world_folder import site_from_folder
 from tests.conftest import Edge
-from tests.support.airframe import EARTH_M, Item, once
+from tests.support.airframe import EARTH_M, Item, without_repeats
 from tests.support.edge_stub import free_port
-from tests.support.flights import arguments, becomes
+from tests.support.flights import arguments, wait_for_reason
 from tests.support.mavsdk_peer import BATTERY_PERCENT, SET_MODE, SPEED, mavsdk_peer
 from tests.support.processes import output_until, run_here, started
 from tests.support.pymavlink_peer import DEFAULT_SPEED, pymavlink_peer
@@ -84,11 +84,11 @@ def test_a_vehicle_of_mavsdk_flies_as_the_edge_decides(
         flown = asyncio.run(run_field_mission(patient_job(port, url, tmp_path, steps=8)))
         decisions = read_decisions(tmp_path / "decisions.jsonl")
         # MAVSDK hands on a message after it has obeyed it.
-        until(lambda: len(once(peer.commands())) >= len(once(commanded.all)))
+        until(lambda: len(without_repeats(peer.commands())) >= len(without_repeats(commanded.all)))
         received = list(peer.received)
     assert [(d.step, d.source) for d in decisions] == [(step, "policy") for step in range(8)]
     assert decisions == flown.decisions and not flown.undecided
-    assert once(peer.commands()) == once(commanded.all)
+    assert without_repeats(peer.commands()) == without_repeats(commanded.all)
     first = decisions[0].velocity
     # One command a decision, and four corrections on the way.
     assert len(commanded.all) <= 5 * len(decisions)
@@ -163,7 +163,7 @@ async def test_who_flies_the_vehicle(missions: list[list[Item]], port: int) -> N
         async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
             uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE))
 
-            await becomes(uav, None)
+            await wait_for_reason(uav, None)
             await uav.command(0)
             assert peer.airframe.mode == "hold"
             await uav.command(0)
@@ -176,20 +176,22 @@ async def test_who_flies_the_vehicle(missions: list[list[Item]], port: int) -> N
                     await asyncio.sleep(0.05)
             await uav.correct(0.0, 10.0)
             assert peer.airframe.speed == pytest.approx(9.0, abs=0.5)
-            commands = once((m.command, m.param2 if m.command == SPEED else m.param3) for _, m in peer.commands())
+            commands = without_repeats(
+                (m.command, m.param2 if m.command == SPEED else m.param3) for _, m in peer.commands()
+            )
             assert commands[:3] == [(SET_MODE, 3.0), (SET_MODE, 4.0), (SPEED, 9.0)]
             assert [kind for kind, _ in commands[3:]] in ([], [SPEED]), (
                 "the same speed again, or what is left of the way"
             )
             count = len(peer.commands())
             peer.airframe.drift_m = 150.0
-            await becomes(uav, "it is off its path")
+            await wait_for_reason(uav, "it is off its path")
             peer.airframe.drift_m = 0.0
-            await becomes(uav, None)
+            await wait_for_reason(uav, None)
             peer.airframe.mode = "hold"
-            await becomes(uav, "it does not fly its mission")
+            await wait_for_reason(uav, "it does not fly its mission")
             peer.airframe.mode = "land"
-            await becomes(uav, "it lands")
+            await wait_for_reason(uav, "it lands")
             assert uav.landed and len(peer.commands()) == count
 
 

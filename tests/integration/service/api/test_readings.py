@@ -13,7 +13,7 @@ from service.api.api_keys import KeyFile
 from shared.client.edge_client import EdgeClient
 from shared.client.errors import EdgeRefused
 from shared.wire.readings import ReadingsRequest, SensorReading
-from tests.support.stored_missions import copy_of, fly, running, same, settled, state
+from tests.support.stored_missions import copy_of, fly, running, same, state, wait_for_updates
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -125,7 +125,7 @@ def test_acknowledged_readings_survive_a_power_failure(tmp_path: Path, report: R
         assert client.post(PATH, json=given).json()["results"] == ["merged"]
         assert client.post(PATH, json=one(sensor_id=8, step=2, message_id="y")).json()["results"] == ["merged"]
         fly(client, report, range(3, 4), owed)
-        mission = settled(engine, engine.missions.loaded[0], 9)
+        mission = wait_for_updates(engine, engine.missions.loaded[0], 9)
         on_disk, before = copy_of(path, tmp_path / "copy.db"), state(mission)
     with running(on_disk) as (client, engine):
         assert client.get("/missions/test").json()["readings"] == 2

@@ -17,7 +17,7 @@ import pytest
 
 from service.api.api_keys import KeyFile
 from tests.support.running import Handler, listening
-from tests.support.stub_llm import misbehaving, saying, wait_for
+from tests.support.stub_llm import http_answer, misbehaving, wait_for
 from tests.support.waiting import PATIENCE_S, Gate, until
 
 Report = Callable[..., dict[str, Any]]
@@ -29,7 +29,7 @@ def behind(gate: Gate) -> Handler:
 
     async def fault(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await gate.passed()
-        await saying(b"200 OK", b'{"choices": [{"message": {"content": "0 7"}}]}')(reader, writer)
+        await http_answer(b"200 OK", b'{"choices": [{"message": {"content": "0 7"}}]}')(reader, writer)
 
     return fault
 
@@ -45,7 +45,7 @@ def test_more_than_may_wait_for_the_llm_are_the_policys_at_once(edge: Edge, repo
             return reason
 
         waiting = [pool.submit(ask, number) for number in range(2)]
-        until(lambda: gate.came == 2)
+        until(lambda: gate.callers == 2)
         assert [ask(number) for number in range(2, 8)] == ["llm_busy"] * 6
         # They wait for none of those that do.
         assert not any(asked.done() for asked in waiting)
@@ -63,7 +63,7 @@ def test_past_the_most_requests_the_next_is_refused_and_probes_are_not(edge: Edg
             return client.post("/decide", json=report(mission_id=f"m{number}")).status_code
 
         inside = [pool.submit(ask, number) for number in range(2)]
-        until(lambda: gate.came == 2)
+        until(lambda: gate.callers == 2)
         refused = client.post("/feedback", json={"decision_id": "0" * 32, "cost": 0.0})
         assert refused.status_code == 503
         assert refused.headers["retry-after"] == "1"

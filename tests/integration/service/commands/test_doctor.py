@@ -14,7 +14,7 @@ from service.commands import banner, doctor
 from service.config.settings import Settings
 from service.storage.locks import FileLock
 from tests.support.running import serving
-from tests.support.stub_llm import StubLlm, said
+from tests.support.stub_llm import StubLlm, chat_completion
 
 
 def free_port() -> int:
@@ -87,8 +87,8 @@ class Thinking(StubLlm):
         if "max_tokens" in body:
             return JSONResponse({"error": {"message": "unsupported", "param": "max_tokens"}}, 400)
         if body["max_completion_tokens"] < 200:
-            return said("<think>Hm", finish_reason="length")
-        return said(f"<think>Hm</think>{self.answer}", {"prompt_tokens": 500, "completion_tokens": 201})
+            return chat_completion("<think>Hm", finish_reason="length")
+        return chat_completion(f"<think>Hm</think>{self.answer}", {"prompt_tokens": 500, "completion_tokens": 201})
 
 
 def test_an_llm_server_is_asked_as_the_edge_asks_it() -> None:

@@ -32,7 +32,7 @@ from shared.world.step_rule import Action
 from shared.world.trajectory import trajectories
 from tests.support.missions import PAPER, attended, uav
 from tests.support.running import listening, serving
-from tests.support.stub_llm import FAULTS, StubLlm, misbehaving, said, wait_for
+from tests.support.stub_llm import FAULTS, StubLlm, chat_completion, misbehaving, wait_for
 from tests.support.waiting import until
 
 Report = Callable[..., dict[str, Any]]
@@ -247,9 +247,11 @@ class Chooser(StubLlm):
         text = "A" if set("?/") & set(body["messages"][-1]["content"]) else self.answer
         usage = {"prompt_tokens": 300, "completion_tokens": 1}
         if not (self.tells and body.get("logprobs")):
-            return said(text, usage)
+            return chat_completion(text, usage)
         likeliest = [{"token": text, "logprob": -0.1}, {"token": "B", "logprob": -2.5}]
-        return said(text, usage, logprobs={"content": [{"token": text, "logprob": -0.1, "top_logprobs": likeliest}]})
+        return chat_completion(
+            text, usage, logprobs={"content": [{"token": text, "logprob": -0.1, "top_logprobs": likeliest}]}
+        )
 
 
 @pytest.mark.parametrize("tells", [True, False])

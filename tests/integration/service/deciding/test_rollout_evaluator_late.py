@@ -89,7 +89,7 @@ def test_what_nobody_waits_for_any_more_is_not_judged(
     judges, many, ask = usable_cores(), usable_cores() + 6, LlmQueries.ask
 
     async def when_all_judge(self: LlmQueries, *asked: Any) -> LlmAdvice:
-        await soon(lambda: stuck.gate.came >= judges)
+        await soon(lambda: stuck.gate.callers >= judges)
         return await ask(self, *asked)
 
     monkeypatch.setattr(LlmQueries, "ask", when_all_judge)
@@ -102,7 +102,7 @@ def test_what_nobody_waits_for_any_more_is_not_judged(
     stuck.gate.open()
     # It is judged behind whatever is queued.
     assert client.post("/decide", json=report(mission_id="m0", step=1)).json()["guided"]
-    assert stuck.gate.came == judges + 1
+    assert stuck.gate.callers == judges + 1
 
 
 def fleet(report: Report) -> dict[str, Any]:
@@ -130,7 +130,7 @@ def test_in_a_batch_the_critic_may_take_what_the_others_do_not_need(
         """The first UAV's half of the minute is over, and the critic is done a moment after that."""
         told = await ask(self, *asked)
         if not clock.ahead_s:
-            await soon(lambda: stuck.gate.came)
+            await soon(lambda: stuck.gate.callers)
             clock.ahead_s = 40.0
             asyncio.get_running_loop().call_later(0.05, stuck.gate.open)
         return told

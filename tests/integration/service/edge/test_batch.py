@@ -24,7 +24,7 @@ from service.prompting.unpruned_state import UnprunedState
 from shared.world.step_rule import Action
 from tests.support.missions import PAPER, attended, mission, uav
 from tests.support.running import serving
-from tests.support.stub_llm import PROBE, StubLlm, said, wait_for
+from tests.support.stub_llm import PROBE, StubLlm, chat_completion, wait_for
 from tests.support.waiting import Clock, Gate, until
 
 Report = Callable[..., dict[str, Any]]
@@ -54,10 +54,12 @@ class Chorus(StubLlm):
             await self.gate.passed()
         lists = body.get("grammar", "").removeprefix("root ::= ").split(r' "\n" ')
         if "7301" in lists[0]:
-            return said(f"{PROBE} 0")
+            return chat_completion(f"{PROBE} 0")
         letters = [next(iter(re.findall(r'"([A-Z])"', choice)), self.answer) for choice in lists]
         usage = {"prompt_tokens": 400, "completion_tokens": 2 * len(lists) - 1}
-        return said("I would rather not." if self.prose else "\n".join(letters[:1] if self.deaf else letters), usage)
+        return chat_completion(
+            "I would rather not." if self.prose else "\n".join(letters[:1] if self.deaf else letters), usage
+        )
 
     def questions(self) -> list[str]:
         """What was asked about decisions: neither probes nor questions that say nothing."""
@@ -211,7 +213,7 @@ def test_a_batch_that_was_sent_again_meanwhile_does_not_count(edge: Edge, report
         wait_for(client, "ready")
         client.put("/missions/test", json={"planner": "off"})
         slow = pool.submit(client.post, "/decide/batch", json=batch(report))
-        until(lambda: chorus.gate.came)
+        until(lambda: chorus.gate.callers)
         chorus.hangs_on = "\0"
         assert client.post("/decide/batch", json=batch(report)).status_code == 200
         chorus.gate.open()

@@ -22,7 +22,7 @@ from shared.wire.schemas import MissionSpec, Outcome
 from shared.world.step_rule import Action
 from tests.support.asking import PATHS, decide
 from tests.support.missions import attended, uav
-from tests.support.stored_missions import fly, running, same, settled, state
+from tests.support.stored_missions import fly, running, same, state, wait_for_updates
 
 Report = Callable[..., dict[str, Any]]
 
@@ -36,7 +36,7 @@ def test_the_same_flight_learns_the_same(tmp_path: Path, report: Report) -> None
     def flown(name: str) -> tuple[dict[str, Any], list[int]]:
         with running(tmp_path / name) as (client, engine):
             fly(client, report, range(20))
-            mission = settled(engine, engine.missions.loaded[0], 57)
+            mission = wait_for_updates(engine, engine.missions.loaded[0], 57)
             unnamed = {key: value for key, value in state(mission).items() if key not in _NAMED}
             return unnamed, mission.records.visits.tolist()
 
@@ -55,7 +55,7 @@ def test_an_outcome_is_learned_after_the_decision_that_it_came_with(tmp_path: Pa
 
     with running(tmp_path / "with.db") as (client, engine):
         taught, mission = told_by(client, engine, 7.0)
-        settled(engine, mission, 1)
+        wait_for_updates(engine, mission, 1)
         later = client.post("/decide", json=report(step=2)).json()["top_k"]
     with running(tmp_path / "without.db") as (client, engine):
         untaught, _ = told_by(client, engine, None)

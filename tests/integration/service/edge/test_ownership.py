@@ -18,7 +18,7 @@ from service.storage.leases import Leases
 from service.storage.store import Store
 from shared.client.edge_client import EdgeClient
 from tests.support.processes import serving_edge
-from tests.support.stored_missions import fly, kept, running
+from tests.support.stored_missions import fly, running, stored_decision
 from tests.support.waiting import PATIENCE_S, Gate, until
 
 Body = dict[str, Any]
@@ -141,7 +141,7 @@ def test_a_decision_that_comes_while_its_mission_is_made_waits_for_it(
     monkeypatch.setattr(stored, "share", sharing)
     with ThreadPoolExecutor(2) as pool, gate:
         made = pool.submit(client.put, "/missions/test", json={})
-        until(lambda: gate.came)
+        until(lambda: gate.callers)
         before = len(came)
         decided = pool.submit(client.post, "/decide", json=report())
         until(lambda: len(came) > before)
@@ -184,7 +184,7 @@ def test_an_outcome_a_note_and_a_deletion_of_a_former_owner_are_refused(
     edges = [start("one", mode="policy")[0], start("two", mode="policy")[0]]
     for turn, request in enumerate(requests):
         former, present = edges[turn % 2], edges[1 - turn % 2]
-        owed = {"decision_id": kept(former, report(step=turn))["decision_id"], "cost": 0.5, "failed": False}
+        owed = {"decision_id": stored_decision(former, report(step=turn))["decision_id"], "cost": 0.5, "failed": False}
         leave(database)
         before = mission(present)
         refused = request(former, owed)
@@ -198,7 +198,7 @@ def test_other_missions_of_the_same_commit_are_written(
 ) -> None:
     one, engine = start()
     for name in ("lost", "held"):
-        kept(one, report(mission_id=name))
+        stored_decision(one, report(mission_id=name))
     database.exec_driver_sql("UPDATE leases SET owner = 'another', epoch = epoch + 1 WHERE mission_id = 'lost'")
     gate, fence = Gate(), Leases.fence
 
@@ -209,7 +209,7 @@ def test_other_missions_of_the_same_commit_are_written(
     monkeypatch.setattr(Leases, "fence", late)
     with ThreadPoolExecutor(3) as pool, gate:
         first = pool.submit(one.post, "/decide", json=report(step=1, mission_id="held"))
-        until(lambda: gate.came)
+        until(lambda: gate.callers)
         both = [pool.submit(one.post, "/decide", json=report(step=2, mission_id=name)) for name in ("lost", "held")]
         until(lambda: len(engine.journal._commits._requests) == 3)  # type: ignore[union-attr]
         gate.open()
@@ -239,10 +239,10 @@ def test_a_renewal_drops_what_others_have_taken_and_lists_what_nobody_has(
     one, engine = start()
     two, _ = start("two")
     for name in ("a", "b"):
-        kept(one, report(mission_id=name))
-    kept(two, report(mission_id="c"))
+        stored_decision(one, report(mission_id=name))
+    stored_decision(two, report(mission_id="c"))
     database.exec_driver_sql("UPDATE leases SET expires_at = clock_timestamp() WHERE mission_id <> 'a'")
-    kept(two, report(step=1, mission_id="b"))
+    stored_decision(two, report(step=1, mission_id="b"))
     ownership(engine)._renew()
     until(lambda: listed(one) == ["a", "c"], lambda: listed(one))
     assert [held.mission_id for held in engine.missions.loaded] == ["a"]
@@ -370,7 +370,7 @@ def test_no_client_is_sent_back_to_the_edge_that_it_asked(
 ) -> None:
     """An edge in place of a killed one has its address, and waits for the end of its leases."""
     killed, _ = start("one")
-    kept(killed, report())
+    stored_decision(killed, report())
     client, _ = start("one")
     refused = client.post("/decide", json=report(step=1))
     assert (refused.status_code, refused.headers["Retry-After"]) == (503, "1")

@@ -35,7 +35,7 @@ from shared.world.step_rule import Action
 from tests.integration.service.api.test_routes import fields
 from tests.support.missions import PAPER, attended, mission, uav
 from tests.support.running import serving
-from tests.support.stub_llm import StubLlm, said, wait_for
+from tests.support.stub_llm import StubLlm, chat_completion, wait_for
 from tests.support.waiting import Gate, soon, until
 
 Report = Callable[..., dict[str, Any]]
@@ -64,7 +64,7 @@ class Scribe(StubLlm):
             return await super().respond(body, probed)
         self.asked.append(body)
         await self.gate.passed()
-        return said(self.orders[min(len(self.asked), len(self.orders)) - 1])
+        return chat_completion(self.orders[min(len(self.asked), len(self.orders)) - 1])
 
 
 def guidance(client: httpx.Client, status: str) -> dict[str, Any]:

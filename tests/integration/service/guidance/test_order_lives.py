@@ -17,7 +17,7 @@ from tests.integration.service.guidance.test_operator_guidance import Edge, Repo
 from tests.support.asking import PATHS, decide
 from tests.support.processes import serving_edge
 from tests.support.running import listening
-from tests.support.stub_llm import misbehaving, saying, wait_for
+from tests.support.stub_llm import http_answer, misbehaving, wait_for
 from tests.support.waiting import PATIENCE_S, Gate, until
 
 VISIT, SLOW = "Visit sensor 4 at least once in every 3 steps", "Never fly faster than 8 m/s"
@@ -167,13 +167,13 @@ def test_a_decision_that_waits_for_the_llm_obeys_orders_that_are_confirmed_meanw
 
     async def slowly(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await gate.passed()
-        await saying(b"200 OK", b'{"choices": [{"message": {"content": "%s"}}]}' % answer)(reader, writer)
+        await http_answer(b"200 OK", b'{"choices": [{"message": {"content": "%s"}}]}' % answer)(reader, writer)
 
     with listening(misbehaving(slowly)) as url, ThreadPoolExecutor(1) as pool, gate:
         client = edge(mode=mode, llm_url=f"{url}/v1", llm_model="stub-1", planner="off")
         wait_for(client, "ready")
         waiting = pool.submit(client.post, "/decide", json=report())
-        until(lambda: gate.came)
+        until(lambda: gate.callers)
         say(client, guidance={"min_velocity": 1, "max_velocity": 1})
         gate.open()
         told = waiting.result().json()

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.integration.service.live.test_broadcaster import Edge, Report, decided, watching
-from tests.support.stored_missions import copy_of, fly, on_disk, running
+from tests.support.stored_missions import copy_of, fly, running, wait_until_written
 from tests.support.waiting import Clock
 
 
@@ -83,7 +83,7 @@ def test_a_fleet_that_is_silent_since_before_a_restart_is_lost(
     path = tmp_path / "missions.db"
     with running(path) as (client, engine):
         fly(client, report, range(3))
-        on_disk(engine)
+        wait_until_written(engine)
         killed = copy_of(path, tmp_path / "killed.db")
     clock = Clock()
     monkeypatch.setattr("service.live.fleet_watch.time", clock)

@@ -15,13 +15,13 @@ from fastapi.responses import JSONResponse, Response
 from service.llm.usability import CircuitBreaker
 from tests.support.missions import PAPER
 from tests.support.running import listening, serving
-from tests.support.stub_llm import FIRST, StubLlm, misbehaving, said, saying, silent, wait_for
+from tests.support.stub_llm import FIRST, StubLlm, chat_completion, http_answer, misbehaving, silent, wait_for
 from tests.support.waiting import Gate, Striding, until
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
 
-ANSWER = saying(b"200 OK", b'{"choices": [{"message": {"content": "0 7"}}]}')
+ANSWER = http_answer(b"200 OK", b'{"choices": [{"message": {"content": "0 7"}}]}')
 
 
 def test_three_failures_open_it_and_one_more_for_longer_until_an_answer_closes_it() -> None:
@@ -100,7 +100,7 @@ def test_who_hardly_waits_does_not_open_it(edge: Edge, report: Report, monkeypat
 
 
 def test_a_request_that_is_not_understood_does_not_open_it(edge: Edge, report: Report) -> None:
-    with listening(misbehaving(saying(b"400 Bad Request", b"{}"))) as url:
+    with listening(misbehaving(http_answer(b"400 Bad Request", b"{}"))) as url:
         client = edge(mode="llm", llm_url=f"{url}/v1", llm_model="stub-1")
         wait_for(client, "ready")
         reasons = {client.post("/decide", json=report(step=step)).json()["reason"] for step in range(6)}
@@ -126,7 +126,7 @@ def test_a_fleet_that_shares_a_deadline_opens_it_too(
 
 def all_came(queue: Gate, many: int, asked: list[Future[httpx.Response]]) -> bool:
     """Whether so many stand in the queue, or nobody does any more."""
-    return queue.came == many or all(one.done() for one in asked)
+    return queue.callers == many or all(one.done() for one in asked)
 
 
 def test_who_stood_in_a_queue_does_not_open_it(edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,7 +136,7 @@ def test_who_stood_in_a_queue_does_not_open_it(edge: Edge, report: Report, monke
     slot, queue = Gate(), Gate()
 
     async def one_by_one(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if slot.came % 2 == 0:
+        if slot.callers % 2 == 0:
             await slot.passed()
             await ANSWER(reader, writer)
         else:
@@ -149,8 +149,8 @@ def test_who_stood_in_a_queue_does_not_open_it(edge: Edge, report: Report, monke
         for step in range(3):
             slot.shut()
             served = pool.submit(client.post, "/decide", json=report(step=step))
-            until(lambda: slot.came % 2)
-            before = queue.came
+            until(lambda: slot.callers % 2)
+            before = queue.callers
             hasty = [report(step=step, uav_id=i, deadline_ms=500) for i in range(1, 10)]
             late = [pool.submit(client.post, "/decide", json=body) for body in hasty]
             until(partial(all_came, queue, before + 9, late))
@@ -162,7 +162,7 @@ def test_who_stood_in_a_queue_does_not_open_it(edge: Edge, report: Report, monke
             reasons = {asked.result().json()["reason"] for asked in late}
             # On a busy machine a UAV may come so late that the others have every sensor.
             assert reasons - {"no_candidate"} == {"llm_timeout"}
-            slot.came += 1
+            slot.callers += 1
         assert client.get("/readyz").json()["llm"] == "ready"
 
 
@@ -175,7 +175,7 @@ def test_a_note_sent_while_it_is_open_is_compiled_when_it_is_well(
     class Ill(StubLlm):
         async def respond(self, body: dict[str, Any], probed: bool) -> Response:
             if body["messages"][0]["content"].startswith("Rewrite"):
-                return said("visit sensor 3 every 3 steps")
+                return chat_completion("visit sensor 3 every 3 steps")
             if probed:
                 await probes.passed()
             failing = body["messages"][-1]["content"] != FIRST and not probed

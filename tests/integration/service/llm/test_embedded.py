@@ -146,7 +146,7 @@ def test_decisions_and_health_go_on_while_the_model_loads(report: Report, monkey
     monkeypatch.setattr("service.llm.embedded.EmbeddedServer", slowly)
     app = create_app(Settings(deadline_ms=60_000))
     with serving(app) as url, httpx.Client(base_url=url, timeout=PATIENCE_S) as client, gate:
-        until(lambda: gate.came)
+        until(lambda: gate.callers)
         assert client.get("/healthz").status_code == 200
         told = client.get("/readyz").json()
         assert (told["llm"], told["detail"]) == ("loading", "the embedded LLM has not answered yet")

@@ -12,7 +12,7 @@ from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 
 from tests.support.running import listening, serving
-from tests.support.stub_llm import FAULTS, FLOODS, PROBE, StubLlm, misbehaving, said, saying, wait_for
+from tests.support.stub_llm import FAULTS, FLOODS, PROBE, StubLlm, chat_completion, http_answer, misbehaving, wait_for
 from tests.support.waiting import until
 
 Report = Callable[..., dict[str, Any]]
@@ -32,7 +32,7 @@ class Model(StubLlm):
             return JSONResponse({"error": "unknown field"}, status_code=400)
         usage = {"prompt_tokens": 300, "completion_tokens": 4, "prompt_tokens_details": {"cached_tokens": 250}}
         hello = f"{PROBE} 0" if self.obeys in ways else "hello"
-        return said(hello if probed else self.answer, usage)
+        return chat_completion(hello if probed else self.answer, usage)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_a_usage_that_makes_no_sense_is_no_usage(edge: Edge, report: Report, pro
         % prompt_tokens
     )
     answer = b'{"choices": [{"message": {"content": "0 7"}}], "usage": %s}' % usage
-    with listening(misbehaving(saying(b"200 OK", answer))) as url:
+    with listening(misbehaving(http_answer(b"200 OK", answer))) as url:
         client = edge(mode="llm", llm_url=f"{url}/v1", llm_model="stub-1")
         wait_for(client, "ready")
         decision = client.post("/decide", json=report()).json()
@@ -126,7 +126,9 @@ class Proxied(StubLlm):
             return self.fault
         held = "grammar" in body
         labels = 'root ::= "A"' in body.get("grammar", "") or body["max_tokens"] == 1
-        return said((f"{PROBE} 0" if held else "hello") if probed and not labels else "A" if labels else self.answer)
+        return chat_completion(
+            (f"{PROBE} 0" if held else "hello") if probed and not labels else "A" if labels else self.answer
+        )
 
 
 _HELD = ("grammar", "structured_outputs", "response_format")
@@ -175,7 +177,7 @@ def test_a_server_whose_answers_cannot_be_used_is_degraded(
         if probed or usable:
             model.answer = "A" if mode == "guided" else "0 7"
             return await answers(body, probed)
-        return said(said_instead) if status == 200 else JSONResponse({"error": said_instead}, status)
+        return chat_completion(said_instead) if status == 200 else JSONResponse({"error": said_instead}, status)
 
     model.respond = respond  # type: ignore[method-assign]
     with serving(model.app) as url:

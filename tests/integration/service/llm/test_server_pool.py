@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from service.config.settings import Settings
 from tests.support.running import listening, serving
-from tests.support.stub_llm import FIRST, StubLlm, misbehaving, saying, silent, wait_for
+from tests.support.stub_llm import FIRST, StubLlm, http_answer, misbehaving, silent, wait_for
 from tests.support.waiting import Gate, Striding, until
 
 Report = Callable[..., dict[str, Any]]
@@ -69,7 +69,10 @@ def test_the_first_that_is_well_decides_and_the_next_where_it_is_gone(edge: Edge
 
 @pytest.mark.usefixtures("left_alone")
 def test_a_server_that_answers_with_errors_costs_nobody_a_decision(edge: Edge, report: Report) -> None:
-    with listening(misbehaving(saying(b"500 Oops", b"oops"))) as first, serving(Named("second", "1 7").app) as second:
+    with (
+        listening(misbehaving(http_answer(b"500 Oops", b"oops"))) as first,
+        serving(Named("second", "1 7").app) as second,
+    ):
         client = edge(mode="llm", llm_url=f"{first}/v1,{second}/v1", llm_model="first,second")
         standing_by(client, 1)
         answers = [client.post("/decide", json=report(step=step)).json() for step in range(5)]
@@ -116,7 +119,7 @@ def test_the_only_server_is_asked_again_beside_itself(edge: Edge, report: Report
 
 
 def test_where_all_fail_the_first_ones_fault_is_told(edge: Edge, report: Report) -> None:
-    bad, worse = saying(b"429 Too Many Requests", b"{}"), saying(b"200 OK", b"<html>")
+    bad, worse = http_answer(b"429 Too Many Requests", b"{}"), http_answer(b"200 OK", b"<html>")
     with listening(misbehaving(bad)) as first, listening(misbehaving(worse)) as second:
         client = edge(mode="llm", llm_url=f"{first}/v1,{second}/v1")
         standing_by(client, 1)

@@ -13,7 +13,7 @@ from fastapi.responses import JSONResponse, Response
 
 from tests.integration.service.llm.test_servers_as_seen import Behaviour, Body, Plain, refused
 from tests.support.running import serving
-from tests.support.stub_llm import FIRST, said, wait_for
+from tests.support.stub_llm import FIRST, chat_completion, wait_for
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -117,8 +117,10 @@ def writes_its_channels_otherwise(body: Body) -> str:
 def is_cut_off_within_its_channels(body: Body) -> Response:
     """ml-explore/mlx-lm#1867"""
     if body["max_tokens"] < 200:
-        return said("<|channel|>analysis<|message|>Sensor 3", finish_reason="length")
-    return said("<|channel|>analysis<|message|>Sensor 3.<|end|><|start|>assistant<|channel|>final<|message|>0 7")
+        return chat_completion("<|channel|>analysis<|message|>Sensor 3", finish_reason="length")
+    return chat_completion(
+        "<|channel|>analysis<|message|>Sensor 3.<|end|><|start|>assistant<|channel|>final<|message|>0 7"
+    )
 
 
 def ends_with_a_special_token(body: Body) -> str:
@@ -301,7 +303,7 @@ def cannot_chat(body: Body) -> Response:
 
 def thinks_without_end(body: Body) -> Response:
     """QwenLM/qwen-code#8818"""
-    return said("<think>Sensor 0 at 7 or sensor 3 at 5", finish_reason="length")
+    return chat_completion("<think>Sensor 0 at 7 or sensor 3 at 5", finish_reason="length")
 
 
 def names_several(body: Body) -> str:

@@ -15,7 +15,7 @@ from fastapi.responses import JSONResponse, RedirectResponse, Response
 
 from tests.integration.service.llm.test_server_pool import standing_by
 from tests.support.running import listening, serving
-from tests.support.stub_llm import FIRST, StubLlm, said, wait_for
+from tests.support.stub_llm import FIRST, StubLlm, chat_completion, wait_for
 from tests.support.waiting import until
 
 Report = Callable[..., dict[str, Any]]
@@ -41,7 +41,7 @@ class Plain(StubLlm):
 
     async def respond(self, body: Body, probed: bool) -> Response:
         answer = self.behaviour(body)
-        return said(answer) if isinstance(answer, str) else answer
+        return chat_completion(answer) if isinstance(answer, str) else answer
 
 
 def wants_max_completion_tokens(body: Body) -> Response | str:
@@ -102,15 +102,15 @@ def thinks_for_200_tokens(body: Body) -> Response:
 
 def thinks_in_tags_for_2000_tokens(body: Body) -> Response:
     if body["max_tokens"] < 2000:
-        return said("<think>Let me see", finish_reason="length")
-    return said("<think>Let me see.</think>0 7", finish_reason="stop")
+        return chat_completion("<think>Let me see", finish_reason="length")
+    return chat_completion("<think>Let me see.</think>0 7", finish_reason="stop")
 
 
 def has_null_content_while_it_thinks(body: Body) -> Response:
     if body["max_tokens"] < 200:
         choice = {"message": {"content": None, "reasoning_content": "Hm"}, "finish_reason": "length"}
         return JSONResponse({"choices": [choice]})
-    return said("0 7")
+    return chat_completion("0 7")
 
 
 def answers_in_parts(body: Body) -> Response:
@@ -127,7 +127,7 @@ def answers_with_a_further_key(body: Body) -> str:
 
 
 def accounts_oddly(body: Body) -> Response:
-    return said("0 7", {"prompt_tokens": "12", "prompt_tokens_details": "none", "completion_tokens": -1})
+    return chat_completion("0 7", {"prompt_tokens": "12", "prompt_tokens_details": "none", "completion_tokens": -1})
 
 
 def sends_usage_as_a_list(body: Body) -> Response:
@@ -196,7 +196,7 @@ def test_the_operators_fields_headers_and_query_are_sent(edge: Edge, report: Rep
         seen.append((request.headers.get("api-key"), request.query_params.get("api-version")))
         body = await request.json()
         thinks = body.get("chat_template_kwargs", {}).get("enable_thinking", True)
-        return said("<think>" if thinks else "0 7")
+        return chat_completion("<think>" if thinks else "0 7")
 
     app = FastAPI()
     app.post("/v1/chat/completions")(complete)

@@ -20,7 +20,7 @@ from service.llm.client import LLMClient
 from tests.integration.service.llm.test_server_pool import Named, standing_by
 from tests.integration.service.llm.test_servers_as_seen import Behaviour, Body, Plain, refused
 from tests.support.running import listening, serving
-from tests.support.stub_llm import FIRST, StubLlm, said, wait_for
+from tests.support.stub_llm import FIRST, StubLlm, chat_completion, wait_for
 from tests.support.waiting import until
 
 Report = Callable[..., dict[str, Any]]
@@ -140,7 +140,7 @@ def test_a_server_that_is_busy_as_it_is_probed_keeps_its_grammar(edge: Edge) -> 
             self.asked += 1
             if self.asked == 1:
                 return JSONResponse({"error": "busy"}, 429, {"Retry-After": "0.1"})
-            return said("7301 0") if "grammar" in body else said("Hello.")
+            return chat_completion("7301 0") if "grammar" in body else chat_completion("Hello.")
 
     with serving(Busy().app) as url:
         client = edge(mode="llm", llm_url=f"{url}/v1")

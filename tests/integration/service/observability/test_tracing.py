@@ -17,7 +17,7 @@ from opentelemetry.proto.trace.v1.trace_pb2 import Span
 
 from tests.support.processes import run, serving_edge
 from tests.support.running import listening, serving
-from tests.support.stub_llm import StubLlm, misbehaving, saying, wait_for
+from tests.support.stub_llm import StubLlm, http_answer, misbehaving, wait_for
 from tests.support.waiting import PATIENCE_S
 
 Report = Callable[..., dict[str, Any]]
@@ -28,7 +28,7 @@ def test_each_line_is_json_and_names_the_mission_and_decision_and_no_secret(tmp_
     keys = tmp_path / "keys.json"
     key = run("keys", "add", "fleet", "--file", str(keys), "--scopes", "decide", "admin").stdout.strip()
     with (
-        listening(misbehaving(saying(b"500 Oops", b"no such key: secret-of-the-llm"))) as llm,
+        listening(misbehaving(http_answer(b"500 Oops", b"no such key: secret-of-the-llm"))) as llm,
         serving_edge(
             AICVDS_MODE="llm",
             AICVDS_LLM_URL=f"{llm}/v1",
@@ -137,7 +137,7 @@ def test_a_decision_is_a_trace_under_its_callers(report: Report) -> None:
 def test_an_llm_that_fails_is_an_error_in_the_trace(report: Report) -> None:
     with (
         collecting() as (collector, spans),
-        listening(misbehaving(saying(b"500 Oops", b"oops"))) as llm,
+        listening(misbehaving(http_answer(b"500 Oops", b"oops"))) as llm,
         serving_edge(AICVDS_MODE="llm", AICVDS_LLM_URL=f"{llm}/v1", OTEL_EXPORTER_OTLP_ENDPOINT=collector) as (
             url,
             process,

@@ -15,7 +15,7 @@ import pytest
 
 from service.server import server
 from tests.support.processes import serving_edge
-from tests.support.stored_missions import kept
+from tests.support.stored_missions import stored_decision
 from tests.support.waiting import PATIENCE_S, until
 
 LEAST = 16
@@ -56,7 +56,7 @@ def test_those_that_there_are_go_on(tmp_path: Path, report: Callable[..., dict[s
         idle[0].sendall(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n\r\n")
         assert idle[0].recv(65536).startswith(b"HTTP/1.1 200 ")
         for step in range(3):
-            kept(uav, report(step=step))
+            stored_decision(uav, report(step=step))
         with pytest.raises(httpx.TransportError):
             httpx.get(f"{url}/healthz", timeout=PATIENCE_S)
         crowd.close()

@@ -18,7 +18,7 @@ from service.mission.mission import Mission
 from service.storage.store import Store, StoredMission
 from tests.support.running import listening
 from tests.support.stored_missions import copy_of, fly, running, writers
-from tests.support.stub_llm import misbehaving, saying, wait_for
+from tests.support.stub_llm import http_answer, misbehaving, wait_for
 from tests.support.waiting import Gate, until
 
 Report = Callable[..., dict[str, Any]]
@@ -29,7 +29,7 @@ def test_what_still_happens_to_a_deleted_mission_is_not_the_next_ones(tmp_path: 
 
     async def slowly(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await gate.passed()
-        await saying(b"200 OK", b'{"choices": [{"message": {"content": "0 7"}}]}')(reader, writer)
+        await http_answer(b"200 OK", b'{"choices": [{"message": {"content": "0 7"}}]}')(reader, writer)
 
     with (
         listening(misbehaving(slowly)) as llm,
@@ -39,7 +39,7 @@ def test_what_still_happens_to_a_deleted_mission_is_not_the_next_ones(tmp_path: 
     ):
         wait_for(client, "ready")
         late = pool.submit(client.post, "/decide", json=report())
-        until(lambda: gate.came)
+        until(lambda: gate.callers)
         assert client.delete("/missions/test").status_code == 204
         assert client.put("/missions/test", json={"mode": "policy"}).status_code == 200
         told = client.post("/decide", json=report()).json()
@@ -110,7 +110,7 @@ def test_a_mission_deleted_while_it_wakes_stays_deleted(
     monkeypatch.setattr(MissionRegistry, "find", finding)
     with running(tmp_path / "m.db") as (client, _), ThreadPoolExecutor(3) as pool, gate:
         got = pool.submit(client.get, "/missions/test")
-        until(lambda: gate.came)
+        until(lambda: gate.callers)
         deleted = pool.submit(client.delete, "/missions/test")
         until(lambda: came == ["find", "delete"])
         decided = pool.submit(client.post, "/decide", json=report())
@@ -125,7 +125,7 @@ def test_a_mission_whose_deletion_is_under_way_does_not_come_back(postgres: str,
         fly(client, report, range(2))
         commits: Any = engine.journal._commits  # type: ignore[union-attr]
         commits._writer._jobs.put(gate.wait)
-        until(lambda: gate.came)
+        until(lambda: gate.callers)
         deleted = pool.submit(client.delete, "/missions/test")
         until(lambda: commits._queue)
         asked = pool.submit(client.get, "/missions/test")

@@ -22,7 +22,7 @@ from service.storage.operations import Change, Entry, Made
 from service.storage.sqlite_writer import Database, identity
 from service.storage.store import Store, cause
 from shared.wire.schemas import MissionSpec
-from tests.support.stored_missions import fly, running, writers, written
+from tests.support.stored_missions import commit_changes, fly, running, writers
 from tests.support.waiting import until
 
 Report = Callable[..., dict[str, Any]]
@@ -228,7 +228,7 @@ async def test_an_edge_that_another_one_followed_writes_no_more(tmp_path: Path) 
     first._lock = lock
     writer = first.writer()
     with pytest.raises(Exception, match="another edge has opened the store's file"):
-        await written(writer, [made("test")])
+        await commit_changes(writer, [made("test")])
     assert second.missions() == []
     writer.close()
     first.close()
@@ -290,12 +290,12 @@ async def test_other_bytes_of_the_same_event_are_an_error(
         epoch = taken
     writer = store.writer()
     right: list[Change] = [made("test", epoch), Entry("test", 1, GuidanceChanged({"note": "a"}), epoch)]
-    await written(writer, right)
+    await commit_changes(writer, right)
     # A repeated event with the same bytes does no harm.
-    await written(writer, right)
+    await commit_changes(writer, right)
     for other in (made("test", epoch, seed=7), Entry("test", 1, GuidanceChanged({"note": "b"}), epoch)):
         with pytest.raises(Exception) as failed:
-            await written(writer, [other])
+            await commit_changes(writer, [other])
         assert cause(failed.value).startswith("another program has written other events of the same mission: ")
     kept = store.load("test")
     assert kept is not None

@@ -19,7 +19,16 @@ from service.config.settings import Settings
 from service.edge.stored_missions import restore_mission
 from service.storage import group_commit, journal
 from service.storage.store import Store
-from tests.support.stored_missions import copy_of, fly, locked, on_disk, running, same, settled, state
+from tests.support.stored_missions import (
+    copy_of,
+    fly,
+    locked,
+    running,
+    same,
+    state,
+    wait_for_updates,
+    wait_until_written,
+)
 from tests.support.waiting import PATIENCE_S, until
 
 Body = dict[str, Any]
@@ -40,8 +49,8 @@ def test_what_is_on_disk_is_the_mission_with_and_without_checkpoints(
         answer = {"guidance": {"sensors": [{"sensor_id": 2, "visit_every": 4}]}}
         assert client.post("/missions/test/guidance", json=answer).status_code == 200
         fly(client, report, range(20))
-        mission = settled(engine, engine.missions.loaded[0], 57)
-        on_disk(engine)
+        mission = wait_for_updates(engine, engine.missions.loaded[0], 57)
+        wait_until_written(engine)
         copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
         before = state(mission)
     store = Store(str(copied))

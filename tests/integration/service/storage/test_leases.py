@@ -23,7 +23,7 @@ from service.storage.operations import Deleted, Made
 from service.storage.rows import SCHEMA
 from service.storage.store import Store
 from shared.wire.schemas import MissionSpec
-from tests.support.stored_missions import written
+from tests.support.stored_missions import commit_changes
 from tests.support.waiting import PATIENCE_S
 
 TERM_S = 3600.0
@@ -206,12 +206,12 @@ async def test_a_transaction_of_a_lost_mission_writes_nothing(store: Store) -> N
     assert acquired(Leases(store._engine)) == 2
     writer = store.writer()
     with pytest.raises(LeaseLost, match="another edge has taken over m$"):
-        await written(writer, [Made("n", spec, resolved, 1), Made("m", spec, resolved, 1)])
+        await commit_changes(writer, [Made("n", spec, resolved, 1), Made("m", spec, resolved, 1)])
     assert store.missions() == []
-    await written(writer, [Made("n", spec, resolved, 1)])
+    await commit_changes(writer, [Made("n", spec, resolved, 1)])
     assert (store.missions(), store.leases.unowned()) == (["n"], ["n"])
     # Deletion ends the lease.
-    await written(writer, [Deleted("n", 1)])
+    await commit_changes(writer, [Deleted("n", 1)])
     assert acquired(Leases(store._engine), "n") == 2
     writer.close()
 

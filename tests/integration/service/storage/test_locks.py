@@ -14,7 +14,7 @@ from sqlalchemy import create_engine, text
 from service.storage.locks import StoreUnusable
 from service.storage.store import Store
 from tests.support.processes import serving_edge
-from tests.support.stored_missions import kept
+from tests.support.stored_missions import stored_decision
 from tests.support.waiting import PATIENCE_S
 
 Report = Callable[..., dict[str, Any]]
@@ -54,7 +54,7 @@ def test_an_edge_ends_though_postgresql_waits_for_a_lock(postgres: str, report: 
         serving_edge(AICVDS_STORE=postgres, AICVDS_MODE="value") as (url, process),
         httpx.Client(base_url=url, timeout=PATIENCE_S) as client,
     ):
-        kept(client, report())
+        stored_decision(client, report())
         with _locking(postgres, "journal"):
             told = client.post("/decide", json=report(step=1)).json()
             assert not told["stored"]

@@ -31,7 +31,7 @@ from shared.wire.schemas import DecideRequest, MissionSpec
 from shared.world.scenario import Scenario
 from tests.support.missions import uav
 from tests.support.running import serving
-from tests.support.stored_missions import copy_of, fly, locked, running, same, settled, state, writers
+from tests.support.stored_missions import copy_of, fly, locked, running, same, state, wait_for_updates, writers
 from tests.support.stub_llm import StubLlm, wait_for
 from tests.support.waiting import PATIENCE_S, soon, until
 
@@ -259,7 +259,7 @@ def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
             assert answer.status_code == 200, answer.text
             owed = {decision["uav_id"]: decision["decision_id"] for decision in answer.json()["decisions"]}
         mission = engine.missions.loaded[0]
-        assert settled(engine, mission, 10).feedback == 15
+        assert wait_for_updates(engine, mission, 10).feedback == 15
         # Not a line for each.
         assert sum("falls behind" in line.message for line in caplog.records) == 1
         copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")

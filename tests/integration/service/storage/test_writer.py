@@ -21,7 +21,7 @@ from service.storage.operations import Change, Checkpoint, Deleted, Made, WriteF
 from service.storage.store import Store
 from shared.wire.schemas import MissionSpec
 from tests.support.processes import serving_edge
-from tests.support.stored_missions import fly, kept, running, writers, written
+from tests.support.stored_missions import commit_changes, fly, running, stored_decision, writers
 from tests.support.waiting import PATIENCE_S
 
 Report = Callable[..., dict[str, Any]]
@@ -74,7 +74,7 @@ def test_the_last_commit_of_a_killed_edge_ends_before_another_edge_begins(tmp_pa
     path = tmp_path / "m.db"
     with serving_edge(AICVDS_STORE=str(path), AICVDS_MODE="value") as (url, process):
         with httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
-            kept(client, report())
+            stored_decision(client, report())
         (writer,) = writers(process.pid)
         writer.suspend()
         assert not httpx.post(f"{url}/decide", json=report(step=1), timeout=PATIENCE_S).json()["stored"]
@@ -103,7 +103,7 @@ def test_what_a_terminal_sends_to_the_edge_is_not_for_its_writer(tmp_path: Path,
 def test_an_edge_ends_though_its_writer_hangs(tmp_path: Path, report: Report) -> None:
     with serving_edge(AICVDS_STORE=str(tmp_path / "m.db"), AICVDS_MODE="value") as (url, process):
         with httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
-            kept(client, report())
+            stored_decision(client, report())
         (writer,) = writers(process.pid)
         writer.suspend()
         assert not httpx.post(f"{url}/decide", json=report(step=1), timeout=PATIENCE_S).json()["stored"]
@@ -118,9 +118,9 @@ async def test_a_writer_that_cannot_be_started_is_tried_again(tmp_path: Path, mo
     monkeypatch.setattr(sys, "executable", str(tmp_path / "none"))
     writer = store.writer()
     with pytest.raises(FileNotFoundError):
-        await written(writer, [Deleted("nobody")])
+        await commit_changes(writer, [Deleted("nobody")])
     monkeypatch.undo()
-    await written(writer, [made("test")])
+    await commit_changes(writer, [made("test")])
     assert store.missions() == ["test"]
     writer.close()
     store.close()
@@ -136,9 +136,9 @@ async def test_a_writer_that_ends_again_and_again_is_told_with_what_it_said(
     writer = store.writer()
     for _ in range(3):
         with pytest.raises(WriteFailed, match="this disk is on fire"):
-            await written(writer, [Deleted("nobody")])
+            await commit_changes(writer, [Deleted("nobody")])
     monkeypatch.undo()
-    await written(writer, [made("test")])
+    await commit_changes(writer, [made("test")])
     assert store.missions() == ["test"]
     writer.close()
     store.close()
@@ -149,10 +149,10 @@ async def test_what_is_larger_than_the_socket_takes_at_once_arrives_whole(tmp_pa
     writer = store.writer()
     states, kept = [os.urandom(5_000_000), os.urandom(9)], "SELECT seq, state FROM checkpoints"
     changes: list[Change] = [made("test"), Checkpoint("test", 7, states[0])]
-    await written(writer, changes)
+    await commit_changes(writer, changes)
     with store._engine.connect() as db:
         assert db.exec_driver_sql(kept).all() == [(7, states[0])]
-    await written(writer, [Checkpoint("test", 8, states[1]), made("other")])
+    await commit_changes(writer, [Checkpoint("test", 8, states[1]), made("other")])
     assert sorted(store.missions()) == ["other", "test"]
     with store._engine.connect() as db:
         assert db.exec_driver_sql(kept).all() == [(8, states[1])]
@@ -166,11 +166,11 @@ async def test_a_transaction_is_written_whole_or_not_at_all_and_the_next_one_is(
     with store._engine.begin() as db:
         db.exec_driver_sql("CREATE TRIGGER t BEFORE INSERT ON checkpoints BEGIN SELECT RAISE(ABORT, 'not today'); END")
     with pytest.raises(WriteFailed, match="not today"):
-        await written(writer, [made("test"), Checkpoint("test", 1, b"")])
+        await commit_changes(writer, [made("test"), Checkpoint("test", 1, b"")])
     assert store.missions() == []
-    await written(writer, [made("test")])
+    await commit_changes(writer, [made("test")])
     # Nor does it matter that it was written already.
-    await written(writer, [made("test")])
+    await commit_changes(writer, [made("test")])
     assert store.missions() == ["test"]
     await asyncio.sleep(0)
     writer.close()

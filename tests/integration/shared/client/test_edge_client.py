@@ -85,7 +85,7 @@ def test_an_exchange_is_measured(stub: EdgeStub, request_: DecideRequest, client
     stub.script = ["slow"]
 
     def take_an_hour() -> None:
-        until(lambda: stub.gate.came)
+        until(lambda: stub.gate.callers)
         clock.ahead_s = 3600.0
         stub.gate.open()
 
@@ -293,7 +293,7 @@ async def test_decisions_are_awaited_concurrently(stub: EdgeStub, request_: Deci
         asked = [edge.decide(request_.model_copy(update={"uav_id": uav})) for uav in range(4)]
         together = asyncio.gather(*asked)
         # Each is answered when all of them have come.
-        await soon(lambda: stub.gate.came == 4)
+        await soon(lambda: stub.gate.callers == 4)
         stub.gate.open()
         exchanges = await together
     assert [exchange.response.uav_id for exchange in exchanges] == [0, 1, 2, 3]
@@ -309,7 +309,7 @@ async def test_a_cancelled_call_is_not_sent_again(stub: EdgeStub, request_: Deci
     stub.otherwise = "busy"
     async with AsyncEdgeClient(stub.url, attempts=100, sleep=sleep) as edge:
         call = asyncio.create_task(edge.decide(request_))
-        await soon(lambda: pause.came)
+        await soon(lambda: pause.callers)
         call.cancel()
         await asyncio.gather(call, return_exceptions=True)
         pause.open()

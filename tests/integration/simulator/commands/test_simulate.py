@@ -291,7 +291,7 @@ def test_sigterm_leaves_a_partial_result(stub: EdgeStub, tmp_path: Path) -> None
         [sys.executable, "-m", "shared.kit.command_line", *arguments], stdout=subprocess.PIPE, text=True
     )
     try:
-        until(lambda: stub.gate.came)
+        until(lambda: stub.gate.callers)
         process.send_signal(signal.SIGTERM)
         printed, _ = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 130

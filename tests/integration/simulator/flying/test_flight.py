@@ -104,7 +104,7 @@ def test_the_summary_has_these_keys(stub: EdgeStub) -> None:
     stub.script = ["slow"]
 
     def take_an_hour() -> None:
-        until(lambda: stub.gate.came)
+        until(lambda: stub.gate.callers)
         clock.ahead_s = 3600.0
         stub.gate.open()
 

@@ -97,7 +97,7 @@ def test_an_interrupted_flight_waits_for_no_scrape(stub: EdgeStub, tmp_path: Pat
     stub.script, stub.otherwise, port = ["ok"] * 3, "slow", free_port()
 
     def interrupt() -> None:
-        until(lambda: stub.gate.came and numbers(port).get("aicvds_flight_steps_flown"))
+        until(lambda: stub.gate.callers and numbers(port).get("aicvds_flight_steps_flown"))
         os.kill(os.getpid(), signal.SIGTERM)
 
     scraper = threading.Thread(target=interrupt, daemon=True)
