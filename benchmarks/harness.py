@@ -161,7 +161,7 @@ def in_turn(
 
 
 def shown(cell: Cell) -> str:
-    """Such as ``0.12 [0.10, 0.15]``; numbers from 100 on are whole."""
+    """The cell as text, such as ``0.12 [0.10, 0.15]``; numbers from 100 on are whole."""
     if isinstance(cell, str):
         return cell
     if isinstance(cell, int | float):

@@ -1,4 +1,4 @@
-"""An adapter of :mod:`lab.adapter.train` as a file for llama.cpp, or such a file as ``adapter.npz`` to go on from.
+"""Convert an adapter of :mod:`lab.adapter.train` to a file for llama.cpp, or such a file to ``adapter.npz``.
 
 python -m lab.adapter.gguf_file runs/adapter/adapter.npz runs/adapter/adapter.gguf
 python -m lab.adapter.gguf_file service/checkpoints/adapter.gguf runs/adapter/begin.npz

@@ -5,7 +5,7 @@
         --tokens 6000 --part 3000 --rate 4e-4 --out runs/adapter
 
 It needs torch and numpy. ``adapter.npz`` has the adapter's tensors by GGUF name; ``python -m lab.adapter.gguf_file``
-makes the file for llama.cpp of them. The same command goes on from ``checkpoint.pt``, which is written each minute.
+makes the file for llama.cpp from it. The same command resumes from ``checkpoint.pt``, which it writes each minute.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def evaluation(model: Model, tokens: PromptTokens, records: RecordTensors, most:
     for k in _ROWS_EVALUATED:
         regret, same, offered = [], [], []
         for rows, which in records.groups(k, 0, held_out=True).items():
-            for some in which[:most].split(512 if device == "cuda" else 32):
-                batch = records.batch(some, k, rows, 0, drawn)
+            for part in which[:most].split(512 if device == "cuda" else 32):
+                batch = records.batch(part, k, rows, 0, drawn)
                 states = model(batch.tokens, layers)[:, -1]
                 options = batch.targets.shape[2]
                 logits = model.logits(states, tokens.letters[: rows * options])

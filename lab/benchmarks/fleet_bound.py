@@ -193,7 +193,7 @@ def _plan_ways(prices: FloatArray, reach: int, used: FloatArray, scratch: _Scrat
 
 
 def relaxed(problem: FleetProblem, cell: int, rounds: int, known: float) -> float:
-    """The best bound of so many rounds; no fleet loses less than any of them.
+    """The best bound of ``rounds`` rounds; no fleet loses less than any of them.
 
     Args:
         known: packets that a flight loses, for the size of the steps.

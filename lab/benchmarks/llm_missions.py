@@ -105,8 +105,8 @@ def main() -> int:
     for name, figure in found.items():
         console.print(f"{name:>18}  {figure}")
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    asked = {name: getattr(args, name) for name in ("missions", "steps", "step_s", "mode", "scenario")}
-    args.out.write_text(json.dumps(asked | found, indent=2) + "\n")
+    options = {name: getattr(args, name) for name in ("missions", "steps", "step_s", "mode", "scenario")}
+    args.out.write_text(json.dumps(options | found, indent=2) + "\n")
     console.print(f"wrote {args.out}")
     return 0
 

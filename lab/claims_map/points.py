@@ -47,9 +47,9 @@ def fill_row(fill: tuple[float, float]) -> str:
 
 def _world(rate: float, fill: tuple[float, float], **fields: float) -> Scenario:
     low, high = (round(share * rate, 6) for share in _SPREAD)
-    given = {"arrival_rate_min": low, "arrival_rate_max": high}
+    rates = {"arrival_rate_min": low, "arrival_rate_max": high}
     return SCENARIOS["paper"].model_copy(
-        update={**given, "initial_queue_min": fill[0], "initial_queue_max": fill[1], **fields}
+        update={**rates, "initial_queue_min": fill[0], "initial_queue_max": fill[1], **fields}
     )
 
 

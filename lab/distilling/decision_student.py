@@ -62,12 +62,12 @@ def agreement(student: DecisionStudent, examples: Sequence[PromptExample]) -> Ag
     student.model.eval()
     same, shown, share, loss = 0, 0, 0.0, 0.0
     for start in range(0, len(examples), _EVALUATION_BATCH):
-        some = examples[start : start + _EVALUATION_BATCH]
-        answer = student.outputs([example.text for example in some]).answer.cpu()
-        targets = Targets.of(some)
-        loss += float(answer_loss(answer, targets)) * len(some)
+        batch = examples[start : start + _EVALUATION_BATCH]
+        answer = student.outputs([example.text for example in batch]).answer.cpu()
+        targets = Targets.of(batch)
+        loss += float(answer_loss(answer, targets)) * len(batch)
         best = answer.masked_fill(~targets.offered, -torch.inf).argmax(dim=1)
-        for example, letter in zip(some, best.tolist(), strict=True):
+        for example, letter in zip(batch, best.tolist(), strict=True):
             place = example.labels.index(LETTERS[letter])
             share += float(example.target[place])
             if example.reference >= 0:

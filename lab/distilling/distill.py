@@ -44,21 +44,21 @@ def distill(args: Distill, console: Console) -> None:
             held = sum(map(len, found.held_out.values()))
             console.print(f"{found.scenario}: {len(found.training)} decisions, {held} held out", highlight=False)
             training += found.training
-            for name, some in found.held_out.items():
-                held_out.setdefault(name, []).extend(some)
+            for name, examples in found.held_out.items():
+                held_out.setdefault(name, []).extend(examples)
     student = DecisionStudent(gguf, STATIC, args.rank, device, args.begin)
     train_showing(student, training, args, console)
-    agreed = {name: agreement(student, _some(some)) for name, some in held_out.items() if some}
+    agreed = {name: agreement(student, _sample(examples)) for name, examples in held_out.items() if examples}
     _report(agreed, console)
     _write(student, agreed, gguf, len(training), args)
 
 
-def _some(held: list[PromptExample]) -> list[PromptExample]:
-    return random.Random(0).sample(held, min(EVALUATED, len(held)))
+def _sample(examples: list[PromptExample]) -> list[PromptExample]:
+    return random.Random(0).sample(examples, min(EVALUATED, len(examples)))
 
 
-def _report(found: dict[str, Agreement], console: Console) -> None:
-    for name, one in found.items():
+def _report(agreements: dict[str, Agreement], console: Console) -> None:
+    for name, one in agreements.items():
         console.print(
             f"{name}: the teacher's sensor in {one.sensor:.0%} of {one.decisions} held-out decisions, "
             f"loss {one.loss:.3f}",

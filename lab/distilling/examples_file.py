@@ -26,7 +26,7 @@ from lab.exploration.rollouts import Header, RolloutStep, read_rollouts
 from service.llm.adapter_version import PROMPT_VERSION
 from service.llm.model_file import sha256
 
-# One of so many missions of a file is held out, and shown in each of these views.
+# One in this many missions of a file is held out, and shown in each of these views.
 HELD_OUT = 11
 _HELD_OUT_VIEWS = {"": LEARNED, " unlearned": UNLEARNED, " unlearned, experienced": EXPERIENCED}
 
@@ -44,7 +44,7 @@ def examples_of(rollouts: Sequence[Path], folder: Path, each: OrderedMap = map) 
     """The examples of each rollouts file.
 
     Args:
-        folder: of the files that keep the examples.
+        folder: of the files in which the examples are stored.
         each: makes the examples of the missions.
 
     Raises:
@@ -65,9 +65,9 @@ def _make(source: Path, kept: Path, each: OrderedMap) -> None:
     training: list[Any] = []
     held_out: dict[str, list[Any]] = {scenario + suffix: [] for suffix in _HELD_OUT_VIEWS}
     missions = ((header, number, logged) for number, logged in enumerate(missions_of(steps)))
-    for suffix, some in chain.from_iterable(each(_of_mission, missions)):
+    for suffix, examples in chain.from_iterable(each(_of_mission, missions)):
         target = training if suffix is None else held_out[scenario + suffix]
-        target += some
+        target += examples
     if not training:
         raise ValueError(f"{source} has no decision with a teacher in its second mission or later")
     half = kept.with_suffix(".part")
@@ -86,7 +86,7 @@ def _of_mission(mission: tuple[Header, int, list[RolloutStep]]) -> list[tuple[st
 def _read(kept: Path) -> Examples:
     with gzip.open(kept, "rt", encoding="utf-8") as file:
         found = json.load(file)
-    held_out = {name: list(map(_example, some)) for name, some in found["held_out"].items()}
+    held_out = {name: list(map(_example, examples)) for name, examples in found["held_out"].items()}
     return Examples(found["scenario"], list(map(_example, found["training"])), held_out)
 
 

@@ -82,7 +82,7 @@ def write_gguf_adapter(
 ) -> None:
     """Write a LoRA adapter for a model of llama.cpp's architecture ``llama``.
 
-    llama.cpp orders the rows of the query and key matrices otherwise than transformers, because of its rotary
+    llama.cpp orders the rows of the query and key matrices differently from transformers, because of its rotary
     embedding: within a head, the second half's row i comes after the first half's row i. So the rows of these matrices'
     B are permuted.
 
@@ -113,12 +113,12 @@ def write_gguf_adapter(
 
 
 def _peft_name(name: str) -> str:
-    """peft's name of a tensor that llama.cpp names so."""
+    """peft's name of a tensor, from llama.cpp's name."""
     block, _, rest = name.partition(".")[2].partition(".")
-    for theirs, ours in _NAMES.items():
+    for matrix, gguf_matrix in _NAMES.items():
         for part, half in _HALVES.items():
-            if rest == f"{ours}.weight.{half}":
-                return f"base_model.model.model.layers.{block}.{theirs}.{part}.weight"
+            if rest == f"{gguf_matrix}.weight.{half}":
+                return f"base_model.model.model.layers.{block}.{matrix}.{part}.weight"
     raise ValueError(f"{name} is no adapter weight of a model of architecture llama")
 
 
@@ -126,10 +126,10 @@ def _target(name: str) -> tuple[str, str]:
     """llama.cpp's name of the matrix, and the half of the adapter."""
     _, _, within = name.partition("layers.")
     layer, _, rest = within.partition(".")
-    for theirs, ours in _NAMES.items():
+    for matrix, gguf_matrix in _NAMES.items():
         for part, half in _HALVES.items():
-            if rest.startswith(f"{theirs}.{part}"):
-                return f"blk.{layer}.{ours}.weight", half
+            if rest.startswith(f"{matrix}.{part}"):
+                return f"blk.{layer}.{gguf_matrix}.weight", half
     raise ValueError(f"{name} is no adapter weight of a model of architecture llama")
 
 

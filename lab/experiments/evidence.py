@@ -12,8 +12,8 @@ from lab.experiments.result import Interval, Paired, Result
 from lab.experiments.stand_ins import NAMES
 from shared.world.channel import FloatArray
 
-# The largest mean loss a step over missions that counts as zero, in a moving average of so many steps, and the fewest
-# that it takes at a mission's end.
+# The largest mean loss a step that counts as zero; the steps of its moving average, and the fewest at a mission's
+# end.
 ZERO = 0.05
 WINDOW, LEAST_REMAINING = 5, 3
 # The paper's method among our schemes, and its references by chance: random draws in place of the LLM or, as a weaker

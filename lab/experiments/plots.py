@@ -232,9 +232,9 @@ def _bar_panel(axes: Axes, result: Result, measure: str, shown: Sequence[str], l
     found = {row: i for row, name in enumerate(shown) if (i := measured(result, name, measure))}
     means = [i.mean for i in found.values()]
     bound = _bound_of(result, measure)
-    alike = bool(means) and min(means) > ALIKE * max(means) and bound is None
+    similar = bool(means) and min(means) > ALIKE * max(means) and bound is None
     # Without zero on its axis, or on a logarithmic one, a bar's length has no meaning.
-    barred = not (alike or _spans_decades(means))
+    barred = not (similar or _spans_decades(means))
     for row, interval in found.items():
         colour, _, marker = looks[shown[row]]
         if barred:
@@ -256,7 +256,7 @@ def _bar_panel(axes: Axes, result: Result, measure: str, shown: Sequence[str], l
     axes.grid(axis="x", color="#dddddd", linewidth=0.6)
     axes.set_xlabel(textwrap.fill(label_of(result, measure), 34))
     axes.xaxis.set_major_locator(MaxNLocator(nbins=5))
-    if not alike and min((i.low for i in found.values()), default=0.0) >= 0:
+    if not similar and min((i.low for i in found.values()), default=0.0) >= 0:
         axes.set_xlim(left=0)
     _scale(axes.xaxis, means)
 

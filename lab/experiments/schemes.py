@@ -123,8 +123,8 @@ def available_locals(*names: str) -> list[Scheme]:
 
     known = {*_OF_THE_LAB, *POLICY_NAMES}
     every = (*_POLICY_LABELS, *(name for name in POLICY_NAMES if name not in _POLICY_LABELS))
-    wanted = names or tuple(name for name in every if name not in _NAMED_ONLY)
-    return [local(name) for name in wanted if name in known]
+    chosen = names or tuple(name for name in every if name not in _NAMED_ONLY)
+    return [local(name) for name in chosen if name in known]
 
 
 def over_edge(
@@ -143,9 +143,9 @@ def over_edge(
         pydantic.ValidationError: the spec is invalid.
     """
     whole = MissionSpec.model_validate({"mode": "llm", "top_k": 5, **spec})
-    given = whole.model_dump(mode="json", exclude_defaults=True, exclude={"scenario", "seed"})
+    fields = whole.model_dump(mode="json", exclude_defaults=True, exclude={"scenario", "seed"})
     decides = OverEdge(
-        spec=given, backing=backing, deadline_ms=deadline_ms, operator=operator, sensor_uplinks=sensor_uplinks
+        spec=fields, backing=backing, deadline_ms=deadline_ms, operator=operator, sensor_uplinks=sensor_uplinks
     )
     return Scheme(name=name, label=label, decides=decides)
 

@@ -124,7 +124,7 @@ def _digits(found: Sequence[Found]) -> int:
 
 
 def cell(found: Found, digits: int = 1) -> str:
-    """A mean with its interval, with so many decimals below 100 and none from there on; a dash for ``None``."""
+    """A mean with its interval, with ``digits`` decimals below 100 and none from 100 on; a dash for ``None``."""
     if found is None:
         return NONE
     decimals = 0 if abs(found.mean) >= 100 else digits

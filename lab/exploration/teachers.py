@@ -17,7 +17,7 @@ Action = tuple[int, int]
 
 # Deterministic seconds of search for the rest of a mission; most worlds of scenario `paper` need a third of them.
 _CLAIRVOYANT_WORK = 2.0
-# In wind it plans again in every step, only so many steps ahead.
+# In wind it plans again in every step, this many steps ahead.
 _WINDY_WORK = 0.3
 _WINDY_STEPS = 10
 

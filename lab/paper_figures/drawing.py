@@ -101,11 +101,11 @@ def losses(folder: Folder, name: str, looks: Looks, flights: Mapping[str, Flown]
 
 def tokens(folder: Folder, name: str, kept: FloatArray, whole: FloatArray) -> None:
     """Tokens of the state block by step with a standard deviation, and their means; from counts ``(S, T, I)``."""
-    given = {"every sensor": (whole, RED, "--"), "attention, k = 5": (kept, BLUE, "-")}
+    curves = {"every sensor": (whole, RED, "--"), "attention, k = 5": (kept, BLUE, "-")}
 
     def draw(picture: Figure) -> None:
         by_step, means = picture.subplots(1, 2, width_ratios=(3, 1))
-        for label, (counts, colour, dash) in given.items():
+        for label, (counts, colour, dash) in curves.items():
             mean, spread = counts.mean(axis=(0, 2)), counts.std(axis=(0, 2))
             steps = np.arange(len(mean))
             by_step.plot(steps, mean, color=colour, ls=dash, label=label)
@@ -120,7 +120,7 @@ def tokens(folder: Folder, name: str, kept: FloatArray, whole: FloatArray) -> No
     folder.figure(name, (DOUBLE_IN, 2.7), draw)
     numbers = [
         (label, step, counts[:, step].mean(), counts[:, step].std())
-        for label, (counts, _, _) in given.items()
+        for label, (counts, _, _) in curves.items()
         for step in range(counts.shape[1])
     ]
     folder.numbers(name, ("rows", "step", "tokens", "standard_deviation"), numbers)
