@@ -13,10 +13,10 @@ _BLOCK, _ZEROS = 2**20, bytes(2**20)
 
 
 def release_library(name: str) -> None:
-    """Give back a loaded library's pages that this process has not written to: Linux reads them again when needed."""
+    """Give back a loaded library's pages that no process has written to: Linux reads them again when needed."""
     with suppress(OSError, AttributeError):
         for first, end, entry in _mappings():
-            if name in entry and re.search(r"Private_Dirty: +0 kB", entry):
+            if name in entry and re.search(r"Anonymous: +0 kB(?s:.*)\nSwap: +0 kB", entry):
                 _give_back(first, end)
 
 
