@@ -62,6 +62,19 @@ def test_who_advised_what_failed_unexpectedly_is_trusted_less() -> None:
     assert trust.weights == before
 
 
+@pytest.mark.parametrize(("cost", "most"), [(30.0, 1.0), (-30.0, -1.0)])
+def test_no_surprise_counts_more_than_one_failed_transmission(cost: float, most: float) -> None:
+    weights = []
+    for surprise in (cost, most):
+        trust = Trust(PRIOR)
+        for _ in range(2):
+            advice = Advice(dict.fromkeys(PRIOR, 0.0), {"llm": 0.5, "value": 0.1, "policy": 0.0}, 0.0)
+            trust.open["a" * 32] = advice
+            trust.settle("a" * 32, surprise)
+        weights.append(trust.weights)
+    assert weights[0] == weights[1] != PRIOR
+
+
 def test_a_cost_that_is_always_higher_than_the_critic_thinks_says_nothing_in_the_end() -> None:
     trust = Trust(PRIOR)
     flown = {"llm": 1.0, "value": 0.0, "policy": 0.0}
@@ -89,3 +102,23 @@ def test_no_loss_however_large_breaks_the_weights(odd: float) -> None:
     trust = Trust(PRIOR)
     advise(trust, {"llm": odd, "value": 0.0, "policy": 0.0}, times=100)
     assert all(math.isfinite(w) and w > 0 for w in trust.weights.values())
+
+
+def test_a_restored_trust_goes_on_as_it_was() -> None:
+    trust, again = Trust(PRIOR), Trust(PRIOR)
+    flown = {"llm": 1.0, "value": 0.2, "policy": 0.0}
+    for number, cost in enumerate((0.9, 0.4, 0.0)):
+        trust.open[f"{number:032x}"] = Advice(dict.fromkeys(PRIOR, 0.5), flown, 0.1)
+        if number < 2:
+            trust.settle(f"{number:032x}", cost)
+    again.load_state_dict(trust.state_dict())
+    for one in (trust, again):
+        one.settle(f"{2:032x}", 0.0)
+    assert again.state_dict() == trust.state_dict()
+    assert trust.weights != PRIOR
+
+
+def test_a_state_of_other_advisers_is_ignored() -> None:
+    trust = Trust(PRIOR)
+    trust.load_state_dict(Trust({"llm": 0.9, "planner": 0.1}).state_dict())
+    assert trust.weights == PRIOR

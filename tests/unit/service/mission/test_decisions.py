@@ -1,6 +1,6 @@
 import pytest
 
-from service.mission.decisions import AppliedOutcomes
+from service.mission.decisions import AppliedOutcomes, Reservation, Reservations
 
 
 def test_what_was_applied_is_known_with_its_sign_and_its_zero() -> None:
@@ -29,3 +29,12 @@ def test_the_oldest_is_forgotten() -> None:
     assert [f"{n:032x}" in applied for n in range(3)] == [False, True, True]
     with pytest.raises(KeyError):
         applied[f"{0:032x}"]
+
+
+def test_the_newest_decision_is_the_latest_that_is_not_in_the_future() -> None:
+    given = Reservations()
+    assert given.newest_at(1e9) is None
+    # The first 12 digits are milliseconds; of an earlier version's ID they are random.
+    for uav, milliseconds in enumerate((5_000, 7_250, 0xF00000000000)):
+        given.reserve(uav, Reservation(uav, uav, f"{milliseconds:012x}{'0' * 20}", 1))
+    assert [given.newest_at(now) for now in (4.0, 6.0, 7.25, 1e9)] == [None, 5.0, 7.25, 7.25]

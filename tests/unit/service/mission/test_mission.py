@@ -1,10 +1,14 @@
 import itertools
 
+import numpy as np
 import pytest
 
 from service.api.mission_answers import status_of
 from service.errors import Conflict, NotFound
+from service.mission.decisions import PENDING_PER_UAV
 from service.mission.mission import Mission
+from shared.planning.guidance_messages import GuidanceAnswer
+from shared.planning.orders import Guidance
 from shared.wire.schemas import Outcome
 from shared.world.step_rule import Action
 from tests.support.missions import attended, mission, uav
@@ -75,6 +79,14 @@ def test_pending_decisions_are_bounded_and_the_forgotten_are_unknown() -> None:
     assert m.pending.find(outcome(ids[-1])) == "applied"
 
 
+def test_a_decision_that_is_forgotten_counts_as_a_visit_for_good() -> None:
+    m = mission()
+    for step in range(1, 40):
+        decide(m, step, step=step)
+    assert m.records.confirmed[1] == 39 - PENDING_PER_UAV
+    assert len(m.records.state_dict()["open"][1]) == PENDING_PER_UAV
+
+
 def test_a_failure_takes_back_only_its_own_visit() -> None:
     m = mission()
     first = decide(m, 1, step=1)
@@ -127,6 +139,20 @@ def test_an_answer_to_an_earlier_attempt_does_not_undo_a_later_one() -> None:
     assert status_of(m).visits == {4: 1}
 
 
+@pytest.mark.parametrize("answered", [1, 2])
+def test_a_third_attempt_is_later_than_the_first_two_whichever_of_them_is_answered(answered: int) -> None:
+    m = mission()
+    open_ = [m.reservations.attempt(1, 0) for _ in range(2)]
+    view = attended(m, uav(step=1), 1)
+    m.commit(view.pending("a" * 32, Action(4, 7)), open_[answered - 1])
+    third = m.reservations.attempt(1, 0)
+    assert third > max(open_)
+    m.commit(view.pending("b" * 32, Action(2, 7)), third)
+    with pytest.raises(Conflict):
+        m.commit(view.pending("c" * 32, Action(1, 7)), open_[1])
+    assert m.reservations.of_others(1, uav_id=1) == {2}
+
+
 def test_a_uav_that_asks_again_gives_its_first_sensor_back() -> None:
     m = mission()
     decide(m, 1, step=5, sensor=0)
@@ -167,3 +193,13 @@ def test_a_uav_that_asks_again_and_again_teaches_once_a_step() -> None:
     assert (m.feedback, len(m.experiences.block)) == (5, 1)
     # It was there all the same.
     assert m.records.visits[1] == 5
+
+
+def test_new_orders_drop_the_plan_that_was_made_without_them() -> None:
+    m = mission()
+    assert m.planner is not None
+    m.observe(uav(), 0)
+    m.planner.plans[0] = np.array([(1, 14), (2, 14)])
+    assert m.planner.action(0) == Action(1, 14)
+    m.answer_guidance(GuidanceAnswer(guidance=Guidance(max_velocity=5)))
+    assert m.planner.action(0) is None

@@ -72,6 +72,23 @@ def test_an_age_counts_back_from_the_beginning_of_the_newest_step(
     assert placed is not None and placed[0].step == step
 
 
+def test_a_step_begins_with_its_first_report_whoever_reports_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    m = flown(7)
+    at(m, 15.0, monkeypatch)
+    m.observe(uav(step=7, uav_id=1), 7)
+    m.observe(uav(step=6, uav_id=2), 6)
+    placed = m.readings.placed([reading(age_s=12.0), reading(age_s=16.0)])
+    assert placed is not None and [one.step for one in placed] == [7, 6]
+
+
+def test_in_a_restored_mission_the_newest_step_begins_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    again = mission()
+    again.load_state_dict(flown(7).state_dict())
+    at(again, 1e6, monkeypatch)
+    placed = again.readings.placed([reading(age_s=0.0), reading(age_s=25.0)])
+    assert placed is not None and [one.step for one in placed] == [7, 4]
+
+
 def test_a_reading_from_before_the_first_step_is_a_known_beginning() -> None:
     m = flown(0)
     assert m.read([reading(queue=10.0, age_s=35.0)]) == ["merged"]
@@ -124,6 +141,16 @@ def test_a_message_counts_once_even_where_its_age_is_rounded_to_a_later_step(mon
     assert m.read([reading(age_s=12.0, message_id="b")]) == ["merged"]
     assert m.read([reading(sensor_id=8, age_s=12.0, message_id="b")]) == ["merged"]
     assert m.readings.merged == 3
+
+
+def test_an_outdated_message_does_not_make_an_earlier_one_count_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    m = flown(5)
+    at(m, 0.0, monkeypatch)
+    assert m.read([reading(age_s=12.0, message_id="a")]) == ["merged"]
+    assert m.read([reading(age_s=25.0, message_id="b")]) == ["outdated"]
+    at(m, 14.0, monkeypatch)
+    assert m.read([reading(age_s=12.0, message_id="a")]) == ["duplicate"]
+    assert m.readings.merged == 1
 
 
 def test_the_rate_is_learned_from_readings_as_from_beacons() -> None:
