@@ -5,6 +5,7 @@ import re
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import httpx
@@ -19,7 +20,7 @@ from service.deciding.llm_query import LlmQueries
 from service.deciding.rollout_evaluator import Evaluation, evaluate
 from service.deciding.rollout_state import RolloutState
 from service.deciding.stopwatch import Deadline
-from service.learning.trust import LLM
+from service.learning.trust import CAP, LLM
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet, velocity_options
 from service.prompting.guided_prompt import GuidedTemplate
@@ -95,6 +96,18 @@ def test_the_velocities_offered_are_spread_over_what_serves_the_sensor() -> None
     distance[:3] = distance[12:] = 1e9
     reach = Reach.of(ExpectedLinks.by_formula(distance, PAPER), np.array([30.0]), np.array([0.5]))
     assert velocity_options(reach, 0, 4) == [3, 6, 8, 11]
+
+
+def test_a_velocity_that_moves_nine_tenths_of_the_most_packets_is_offered() -> None:
+    reach = Reach.of(ExpectedLinks.by_formula(np.full((5, 1), 50.0), PAPER), np.array([30.0]), np.array([0.5]))
+    reach = replace(reach, packets=np.array([[26.9], [27.0], [30.0], [27.1], [20.0]]))
+    assert velocity_options(reach, 0, 3) == [1, 2, 3]
+
+
+def test_an_experience_has_its_cost_in_tenths_of_two_digits_at_most() -> None:
+    seen = {"queue": "20", "age": "0"}
+    lines = [TEMPLATE.experience(seen, Action(1, 7), cost, failed=True) for cost in (9.9, 10.0, 13.0)]
+    assert lines == ["20,0>7:99\n"] * 3
 
 
 def test_the_critic_sees_what_is_lost_by_flying_away_from_a_full_queue() -> None:
@@ -222,6 +235,18 @@ def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
     verdict = made.conclude(mission.trust["stub"], judgement, told, calibrated=False)
     assert verdict is not None
     assert verdict.action != made.candidates.actions[made.candidates.labels[worst]]
+
+
+def test_in_an_advisers_regret_no_candidate_counts_for_more_than_the_cap() -> None:
+    mission = guided(planner="off")
+    _view, made = deliberation(mission)
+    lost = np.full(len(made.candidates.actions), 50.0)
+    lost[0] = 0.0
+    verdict = made.conclude(mission.trust["stub"], Evaluation(lost, lost), None, calibrated=False)
+    assert verdict is not None and verdict.action == made.candidates.actions[0]
+    for name, probabilities in made.advised.items():
+        assert verdict.advice.regret[name] == pytest.approx(CAP * (1.0 - probabilities[0]))
+        assert verdict.advice.flown[name] == pytest.approx(probabilities[0])
 
 
 def test_what_others_got_meanwhile_is_not_flown() -> None:

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
 import httpx
 import pytest
+from fastapi.responses import Response
 
 from service.deciding.attended_state import AttendedState
 from service.deciding.modes import verify
 from service.llm.answers import NoDecision
 from service.mission.mission import Mission
+from service.prompting.compact_prompt import sign
 from shared.wire.schemas import MissionSpec
 from shared.world.step_rule import Action
 from tests.support.missions import attended, mission, uav
 from tests.support.running import serving
-from tests.support.stub_llm import StubLlm, wait_for
+from tests.support.stub_llm import StubLlm, said, wait_for
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -84,3 +87,33 @@ def test_an_llm_that_names_what_is_out_of_reach_is_overridden_and_counted(
             f'aicvds_decisions_total{{reason="{reason or "none"}",source="{source}"}} 1.0'
             in client.get("/metrics").text
         )
+
+
+class Namer(StubLlm):
+    """Answers the first letter of a sensor's row in the compact prompt."""
+
+    def __init__(self, sensor: int) -> None:
+        super().__init__("A")
+        self.sensor = sensor
+
+    async def respond(self, body: dict[str, Any], probed: bool) -> Response:
+        row = re.search(rf"\d{sign(self.sensor)}\d{{7}}([A-T])", body["messages"][-1]["content"])
+        return said(self.answer if row is None else row[1])
+
+
+@pytest.mark.parametrize(
+    ("sensor", "verified", "source", "reason"),
+    [(2, "on", "policy", "rule_reach"), (2, "off", "llm", None), (1, "on", "llm", None)],
+)
+def test_a_letter_of_a_sensor_out_of_reach_is_overridden_too(
+    edge: Edge, report: Report, sensor: int, verified: str, source: str, reason: str | None
+) -> None:
+    with serving(Namer(sensor).app) as llm:
+        client = edge(mode="llm", llm_url=f"{llm}/v1", llm_adapter="served", verify=verified)
+        wait_for(client, "ready")
+        assert client.put("/missions/test", json={}).json()["prompt"]["format"] == "compact"
+        body = report()
+        body["sensors"]["x"][2], body["sensors"]["y"][2] = 10.0, 990.0
+        answer = client.post("/decide", json=body).json()
+        assert (answer["source"], answer["reason"]) == (source, reason)
+        assert (answer["sensor_id"] == sensor) == (source == "llm")

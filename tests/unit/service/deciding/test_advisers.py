@@ -1,10 +1,12 @@
 import math
 
+import numpy as np
 import pytest
 
-from service.deciding.advisers import look_ahead
+from service.deciding.advisers import LearnedValues, look_ahead
 from shared.features.augmented_state import State
 from shared.world.channel import link_holds
+from shared.world.step_rule import Action
 from shared.world.trajectory import trajectories
 from tests.support.missions import PAPER, attended, mission, uav
 
@@ -53,3 +55,11 @@ def test_an_empty_battery_sends_nothing(position: tuple[float, float]) -> None:
     report.sensors.battery[1] = 0.0
     s = attended(mission(), report).state
     assert look_ahead(s, s.reach_ahead(0, PAPER), frozenset())[0] == 0
+
+
+def test_a_sensor_that_attention_dropped_is_as_unlikely_as_the_worst_that_it_kept() -> None:
+    values = {2: np.array([0.1, 0.3], dtype=np.float32), 5: np.array([0.0, 0.2], dtype=np.float32)}
+    learned = LearnedValues(Action(2, 1), values)
+    best, worst, dropped = learned.probabilities([Action(2, 1), Action(5, 0), Action(9, 1)])
+    assert best > 100 * worst
+    assert dropped == worst

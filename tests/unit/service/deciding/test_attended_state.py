@@ -1,6 +1,9 @@
 import numpy as np
+import pytest
 
 from shared.features.augmented_state import FEATURES
+from shared.planning.guidance_messages import GuidanceAnswer
+from shared.planning.orders import Guidance, SensorWish
 from shared.wire.schemas import MissionSpec
 from shared.world.channel import channel_gain_db
 from shared.world.step_rule import Action
@@ -58,3 +61,22 @@ def test_the_shipped_start_prefers_a_full_queue_among_sensors_visited_alike() ->
     view = attended(m, report)
     assert view.state.queue.argmax() == 5
     assert view.kept_ids[0] == 5
+
+
+def test_a_sensors_probability_is_the_sum_of_its_answers() -> None:
+    view = attended(mission(top_k=2), uav())
+    first, second = view.kept_ids
+    view.show_probabilities([first, second, first, 99], np.array([0.2, 0.3, 0.4, 0.1]))
+    assert [candidate.llm for candidate in view.candidates] == [0.6, 0.3]
+
+
+def test_orders_add_the_packets_that_they_are_worth_to_a_score_as_shares_of_a_full_queue() -> None:
+    m = mission(top_k=6)
+    before = {one.sensor_id: one.score for one in attended(m, uav()).candidates}
+    m.answer_guidance(GuidanceAnswer(guidance=Guidance(sensors=[SensorWish(sensor_id=2, weight=3.0)])))
+    view = attended(m, uav())
+    assert view.prompt_view.added is not None and view.state.ids.tolist() == list(range(6))
+    assert view.prompt_view.added[2] > 1.0
+    for one in view.candidates:
+        added = view.prompt_view.added[one.sensor_id] / PAPER.queue_capacity
+        assert one.score == pytest.approx(before[one.sensor_id] + added, abs=1e-5)

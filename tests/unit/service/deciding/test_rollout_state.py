@@ -1,0 +1,66 @@
+"""The rollout evaluator's initial state: its horizon, and what other UAVs have decided in the same step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.deciding.rollout_evaluator import evaluate
+from service.deciding.rollout_state import RolloutState
+from shared.belief.fleet_belief import FleetBelief
+from shared.world.scenario import SCENARIOS
+from shared.world.step_rule import Action
+
+PAPER = SCENARIOS["paper"]
+CAPACITY = float(PAPER.queue_capacity)
+
+
+def fleet(step: int = 4, battery: tuple[float, float] = (50.0, 50.0)) -> FleetBelief:
+    """UAV 0 has two full sensors near its start, heard in this step; UAV 1 is on its own lap, far from both."""
+    belief = FleetBelief(PAPER)
+    belief.advance(step)
+    x, y = belief.trajectory(0).at(0.0).tolist()
+    for uav in range(2):
+        belief.locate(uav, step, tuple(belief.trajectory(uav).at(0.0).tolist()), 0.0)
+    places = np.array([(x, y + 30.0), (x, y - 30.0)])
+    belief.hear(np.arange(2), places, np.full(2, step), np.full(2, CAPACITY), np.array(battery))
+    return belief
+
+
+@pytest.mark.parametrize(
+    ("step", "horizon"), [(0, 8), (PAPER.steps - 3, 3), (PAPER.steps - 1, 1), (PAPER.steps, 8), (PAPER.steps + 5, 8)]
+)
+def test_the_horizon_ends_with_the_scenario_and_is_whole_again_for_a_fleet_that_flies_on(
+    step: int, horizon: int
+) -> None:
+    assert RolloutState.of(fleet(step), PAPER, step, 0).horizon == horizon
+
+
+def test_a_visit_that_another_uav_has_decided_counts_where_its_link_is_likely() -> None:
+    belief = fleet()
+    belief.record_decision(0, 4, 1, 0)
+    state = RolloutState.of(belief, PAPER, 4, 1)
+    assert state.visited[1] == 4
+    row = state.sensors.tolist().index(1)
+    assert (state.queue[row], state.age[row]) == (0.0, 0)
+
+
+def test_a_visit_that_another_uav_has_decided_out_of_its_reach_counts_for_nothing() -> None:
+    belief = fleet()
+    before = RolloutState.of(belief, PAPER, 4, 0)
+    belief.record_decision(1, 4, 1, 0)
+    state = RolloutState.of(belief, PAPER, 4, 0)
+    assert state.decided == {1: 0}
+    assert state.visited[1] == before.visited[1] < 4
+    assert state.queue.tolist() == before.queue.tolist() == [CAPACITY, CAPACITY]
+
+
+def test_a_sensor_with_a_flat_battery_has_no_packets_to_lose() -> None:
+    state = RolloutState.of(fleet(battery=(50.0, 0.0)), PAPER, 4, 0)
+    assert state.queue.tolist() == [CAPACITY, 0.0]
+    assert not state.unknown.any()
+
+
+def test_a_candidate_whose_sensor_another_uav_has_reserved_fails() -> None:
+    judged = evaluate(RolloutState.of(fleet(), PAPER, 4, 0, reserved={1}), [Action(0, 0), Action(1, 0)])
+    assert judged.cost[1] >= 1.0 > judged.cost[0]
