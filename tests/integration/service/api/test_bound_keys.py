@@ -18,6 +18,7 @@ from service.api.openapi import REQUESTS
 from service.commands.keys import main
 from service.config.settings import Settings
 from tests.integration.service.api.test_authentication import bearer
+from tests.support.stored_missions import running
 from tests.support.waiting import PATIENCE_S
 
 Edge = Callable[..., httpx.Client]
@@ -200,6 +201,20 @@ def test_an_outcome_without_a_mission_finds_a_keys_own_decisions_only(flown: Any
     assert foreign.text.replace(decisions[FOREIGN], "0" * 32) == unknown.text
     mine = client.post("/feedback", json={"decision_id": decisions[MINE], "cost": 0.1}, headers=key)
     assert mine.json()["result"] == "applied"
+
+
+@pytest.mark.parametrize(("binding", "status"), [("prefix", 404), ("operator", 200)])
+def test_an_outcome_without_a_mission_finds_the_stored_default_with_a_key_for_it_only(
+    keys: Any, tmp_path: Path, report: Report, binding: str, status: int
+) -> None:
+    path, shown = keys
+    with running(tmp_path / "m.db") as (client, _):
+        decision = client.post("/decide", json=report(mission_id="default")).json()["decision_id"]
+    with running(tmp_path / "m.db", keys=path) as (client, engine):
+        key = bearer(shown[binding, frozenset({"decide"})])
+        answer = client.post("/feedback", json={"decision_id": decision, "cost": 0.1}, headers=key)
+        assert answer.status_code == status
+        assert engine.missions.stored == (["default"] if status == 404 else [])
 
 
 def test_an_outcome_in_a_report_is_of_the_reports_mission(flown: Any, keys: Any, report: Report) -> None:

@@ -6,6 +6,7 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -24,6 +25,7 @@ from service.prompting.unpruned_state import UnprunedState
 from shared.world.step_rule import Action
 from tests.support.missions import PAPER, attended, mission, uav
 from tests.support.running import serving
+from tests.support.stored_missions import running
 from tests.support.stub_llm import PROBE, StubLlm, chat_completion, wait_for
 from tests.support.waiting import Clock, Gate, until
 
@@ -192,6 +194,28 @@ def test_a_server_that_hangs_keeps_no_fleet_waiting(
         clock.ahead_s = 0.0
         client.post("/decide/batch", json=fleet(report, 8, 2))
     assert [question.count("UAV") for question in chorus.questions()[:3]] == [8, 8, 0]
+
+
+@pytest.mark.parametrize(("own_s", "most_s"), [(0.01, 45.0), (5.0, 30.0), (8.0, None)])
+def test_a_query_about_all_leaves_twice_the_time_that_the_decisions_need(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch, own_s: float, most_s: float | None
+) -> None:
+    """Of a minute for three UAVs. With less than a quarter of it the LLM is not asked about all."""
+    given_s = list[float]()
+
+    async def timed(
+        self: LlmQueries, mission: Mission, states: Sequence[AttendedState], deadline: Deadline
+    ) -> dict[int, LlmAdvice]:
+        given_s.append(deadline.at - time.perf_counter())
+        return {}
+
+    monkeypatch.setattr(LlmQueries, "may_ask_for_fleet", lambda self, mission, uavs: True)
+    monkeypatch.setattr(LlmQueries, "ask_for_fleet", timed)
+    with running(tmp_path / "m.db", mode="guided", llm_gguf="none", planner="off") as (client, engine):
+        engine.pipeline.own_s = own_s
+        decided(client, batch(report, deadline_ms=60_000))
+    assert len(given_s) == (most_s is not None)
+    assert all(seconds <= most_s for seconds in given_s if most_s is not None)
 
 
 def test_a_question_that_is_refused_is_put_one_by_one_in_the_same_step(edge: Edge, report: Report) -> None:

@@ -200,6 +200,21 @@ def test_an_order_ends_with_a_visit_that_succeeded(edge: Edge, report: Report) -
     assert "deadlines" not in client.get("/missions/test").json()
 
 
+def test_an_order_that_ends_between_two_decisions_of_a_step_was_in_force_in_that_step(
+    edge: Edge, report: Report
+) -> None:
+    client = edge()
+    client.put("/missions/test", json={})
+    sensor = client.post("/decide", json=report()).json()["sensor_id"]
+    say(client, guidance={"max_velocity": 2, "ends": {"max_velocity": {"visited": sensor}}})
+    decision = client.post("/decide", json=report(step=1)).json()
+    assert (decision["sensor_id"], decision["velocity"] <= 2) == (sensor, True)
+    client.post("/feedback", json={"decision_id": decision["decision_id"], "cost": 0.0})
+    client.post("/decide", json=report(step=1, uav_id=1))
+    told = client.get(AT).json()
+    assert (told["obeyed_in_words"], spans(told)) == (None, [("max_velocity", 1, 2)])
+
+
 def test_ends_and_records_are_kept_through_a_restart(report: Report, tmp_path: Path) -> None:
     env = {"AICVDS_STORE": str(tmp_path / "missions.db"), "AICVDS_MODE": "value"}
     told: dict[str, Any] = {}

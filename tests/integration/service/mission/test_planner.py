@@ -153,6 +153,23 @@ def test_a_batch_is_planned_at_once_from_all_reports(edge: Edge, monkeypatch: py
     assert {answer["reason"] for answer in answers} == {"mode_policy"}
 
 
+def test_after_a_uav_that_departs_from_the_plan_the_rest_of_a_batch_is_planned_anew(
+    edge: Edge, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here the search finds no plan, so that every UAV departs."""
+    plans = []
+
+    async def fruitless(self: planner.MissionPlanner, uavs: Any, *args: Any) -> None:
+        plans.append(list(uavs))
+
+    monkeypatch.setattr(planner.MissionPlanner, "plan", fruitless)
+    client = edge(mode="policy")
+    client.put("/missions/test", json={"scenario": SHORT.model_dump(mode="json")}).raise_for_status()
+    answers = client.post("/decide/batch", json=batch_of(SHORT)).json()["decisions"]
+    assert plans == [[0, 1, 2], [1, 2], [2]]
+    assert len({answer["sensor_id"] for answer in answers}) == 3
+
+
 def test_a_large_batch_is_planned_in_groups(edge: Edge, monkeypatch: pytest.MonkeyPatch) -> None:
     groups = []
     real = planner.MissionPlanner.draft
