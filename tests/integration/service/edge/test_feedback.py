@@ -17,7 +17,7 @@ from service.edge.feedback import Feedback, LearningQueue
 from service.live.broadcaster import Broadcaster
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
-from service.storage.journal import NullJournal
+from service.storage.journal import Journal, MissionLog, NullJournal
 from shared.wire.schemas import MissionSpec, Outcome
 from shared.world.step_rule import Action
 from tests.support.asking import PATHS, decide
@@ -77,6 +77,26 @@ def test_a_request_that_comes_at_once_decides_with_every_earlier_outcome_learned
         assert mission.learner.updates == 0
         decide(client, path, report(step=3))
         assert mission.learner.updates == 1
+
+
+def test_a_checkpoint_has_learned_from_every_outcome_that_it_replaces(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here one is due after every answer, and the event loop never trains by itself."""
+    due, checkpoint, learned = Journal.due, Journal.checkpoint, dict[int, int]()
+
+    def noted(journal: Journal, mission_log: MissionLog, written: dict[str, Any]) -> None:
+        learned.setdefault(written["feedback"], written["learner"]["updates"])
+        checkpoint(journal, mission_log, written)
+
+    monkeypatch.setattr(LearningQueue, "train_some", lambda queue: None)
+    monkeypatch.setattr(Journal, "due", lambda journal, mission, least=1: due(journal, mission, 1))
+    monkeypatch.setattr(Journal, "checkpoint", noted)
+    with running(tmp_path / "m.db") as (client, _):
+        for step in range(2):
+            outcome = {"decision_id": client.post("/decide", json=report(step=step)).json()["decision_id"], "cost": 7.0}
+            assert client.post("/feedback", json=outcome).json()["result"] == "applied"
+    assert learned == {0: 0, 1: 1, 2: 2}
 
 
 @pytest.mark.long
