@@ -19,7 +19,7 @@ from shared.wire.schemas import MissionSpec
 from shared.world.step_rule import Action
 from tests.support.missions import attended, mission, uav
 from tests.support.running import serving
-from tests.support.stub_llm import StubLlm, said, wait_for
+from tests.support.stub_llm import StubLlm, chat_completion, wait_for
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -98,7 +98,7 @@ class Namer(StubLlm):
 
     async def respond(self, body: dict[str, Any], probed: bool) -> Response:
         row = re.search(rf"\d{sign(self.sensor)}\d{{7}}([A-T])", body["messages"][-1]["content"])
-        return said(self.answer if row is None else row[1])
+        return chat_completion(self.answer if row is None else row[1])
 
 
 @pytest.mark.parametrize(
