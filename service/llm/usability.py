@@ -132,13 +132,13 @@ class Usability:
         """Pause and probe until the answers can be used; each pause is twice as long, up to eight minutes."""
         while self.degraded is not None:
             await asyncio.sleep(self._pause_s)
-            self._pause_s = min(_LONGEST_UNUSABLE_S, 2.0 * self._pause_s)
+            self._pause_s = min(_LONGEST_UNUSABLE_S, 2.0 * self._pause_s) if self.degraded else FIRST_UNUSABLE_S
             try:
                 await self._probe()
             except (NoDecision, TimeoutError) as error:
                 log.info("the LLM's answers are still unusable: %s", error or "none in time")
             else:
-                self._suspect = True
+                self._suspect = self.degraded is not None
                 self._restore()
 
     def _restore(self) -> None:
