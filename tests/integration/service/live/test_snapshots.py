@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from tests.integration.service.live.test_broadcaster import Edge, Report, decided, watching
+from tests.support.running import serving
 from tests.support.stored_missions import copy_of, fly, running, wait_until_written
+from tests.support.stub_llm import StubLlm, wait_for
 from tests.support.waiting import Clock
 
 
@@ -92,3 +94,16 @@ def test_a_fleet_that_is_silent_since_before_a_restart_is_lost(
         with running(stored) as (client, _):
             assert set(client.get("/missions/test").json()["alarms"]["uav_lost"]) == {"0", "1", "2"}
             assert 'aicvds_alarms{kind="uav_lost"} 3.0' in client.get("/metrics").text
+
+
+def test_a_prompt_says_whether_the_llm_got_it(edge: Edge, report: Report) -> None:
+    with serving(StubLlm().app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        client.put("/missions/value", json={"mode": "value"})
+        asked = {
+            mission: client.get(f"/missions/{mission}/decisions/{name}/prompt").json()["asked"]
+            for mission in ("test", "value")
+            for name in [decided(client, report(mission_id=mission))]
+        }
+    assert asked == {"test": True, "value": False}

@@ -42,6 +42,14 @@ def test_a_uav_far_from_its_trajectory_is_off_its_path() -> None:
     assert found(fleet) == {"uav_off_path": {0: None}}
 
 
+def test_a_lost_uav_is_not_off_its_path_too() -> None:
+    fleet = mission()
+    fly(fleet, 0, number=1, off_m=60.0)
+    assert found(fleet) == {"uav_off_path": {1: None}}
+    fly(fleet, 4)
+    assert found(fleet) == {"uav_lost": {1: 0}}
+
+
 def test_a_visit_is_late_once_its_step_is_past() -> None:
     fleet = mission()
     fly(fleet, 10)

@@ -8,6 +8,7 @@ from service.live.fleet_watch import FleetWatch
 from service.mission.mission import Mission
 from shared.wire.schemas import UavState
 from tests.support.missions import mission, uav
+from tests.support.waiting import Clock
 
 
 def watch(fleet: Mission, *reports: UavState) -> FleetWatch:
@@ -61,3 +62,16 @@ def test_a_forgotten_mission_begins_anew() -> None:
     assert watched.of("test").totals()["idle_s"] is not None
     watched.forget("test")
     assert watched.of("test").totals()["idle_s"] is None
+
+
+def test_a_step_took_the_time_between_the_first_reports_of_two_consecutive_steps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock, fleet, watched = Clock(), mission(), FleetWatch()
+    monkeypatch.setattr("service.live.fleet_watch.time", clock)
+    # The second report of step 1 begins no step, and steps 2 to 4 are missing.
+    for step, ahead_s in ((0, 0.0), (1, 1000.0), (1, 1500.0), (5, 9000.0)):
+        clock.ahead_s = ahead_s
+        fleet.observe(uav(step=step), step)
+        watched.decided(fleet, uav(step=step), step)
+    assert watched.of("test").step_took_s == pytest.approx(1000.0, abs=100.0)
