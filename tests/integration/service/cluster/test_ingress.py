@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import AsyncIterator, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +22,7 @@ from service.config.settings import Settings
 from shared.wire.missions import MissionLine, MissionList
 from shared.wire.schemas import Readiness
 from tests.support.edge_stub import free_port
-from tests.support.running import serving
+from tests.support.running import listening, serving
 
 
 class Replies:
@@ -47,10 +48,10 @@ class Replies:
         return self.answer.body.decode() if isinstance(self.answer, Answer) else ""
 
 
-def listed(decided_at: float, newest: str | None, **modes: str | None) -> Answer:
+def listed(decided_at: float, newest: str | None, more: int = 0, **modes: str | None) -> Answer:
     """An edge's list of missions."""
     lines = [MissionLine(mission_id=name, mode=mode) for name, mode in modes.items()]  # type: ignore[arg-type]
-    body = MissionList(missions=lines, more=0, newest=newest, may_command=True).model_dump_json().encode()
+    body = MissionList(missions=lines, more=more, newest=newest, may_command=True).model_dump_json().encode()
     return Answer(200, [(DECIDED_AT.encode(), repr(decided_at).encode())], body)
 
 
@@ -120,6 +121,23 @@ def test_the_missions_of_all_edges_are_one_list() -> None:
     assert answer["newest"] == "y" and answer["may_command"] and answer["more"] == 0
 
 
+def test_a_mission_in_several_lists_is_shown_as_the_edge_that_has_loaded_it_shows_it() -> None:
+    owners = Replies(
+        OwnersGone(""), {"a": listed(2.0, None, m=None, n="value"), "b": listed(1.0, None, m="llm", n=None)}
+    )
+    with ingress(owners) as client:
+        lines = client.get("/missions").json()["missions"]
+    assert {line["mission_id"]: line["mode"] for line in lines} == {"m": "llm", "n": "value"}
+
+
+def test_the_number_of_missions_left_out_is_that_of_all_edges() -> None:
+    full = {f"x{number}": "value" for number in range(150)}, {f"y{number}": "value" for number in range(150)}
+    owners = Replies(OwnersGone(""), {"a": listed(1.0, None, 7, **full[0]), "b": listed(2.0, None, 5, **full[1])})
+    with ingress(owners) as client:
+        answer = client.get("/missions").json()
+    assert (len(answer["missions"]), answer["more"]) == (200, 7 + 5 + 100)
+
+
 def test_the_metrics_of_all_edges_have_their_addresses() -> None:
     texts = {
         name: Answer(200, [(b"content-type", b"text/plain")], f"# HELP up u\n# TYPE up gauge\nup {number}\n".encode())
@@ -143,6 +161,15 @@ def test_the_cluster_is_ready_when_all_edges_are() -> None:
     with ingress(Replies(OwnersGone(""), answers)) as client:
         answer = client.get("/readyz")
     assert answer.status_code == 503 and answer.json()["detail"] == "b"
+
+
+def test_the_llm_of_the_cluster_is_ready_when_that_of_each_edge_is() -> None:
+    states = {"a": Readiness(ready=True, decides="llm", llm="ready")}
+    states["b"] = Readiness(ready=True, decides="policy", llm="loading")
+    answers = {name: Answer(200, [], state.model_dump_json().encode()) for name, state in states.items()}
+    with ingress(Replies(OwnersGone(""), answers)) as client:
+        answer = client.get("/readyz")
+    assert (answer.status_code, answer.json()["llm"], answer.json()["decides"]) == (200, "loading", "policy")
 
 
 def test_an_outcome_without_a_mission_is_for_the_edge_that_knows_its_decision() -> None:
@@ -203,6 +230,26 @@ def test_of_a_remembered_owner_that_goes_every_request_is_answered() -> None:
             owners.answer = Answer(200, [], b"{}")
             answers = list(pool.map(lambda step: client.post("/decide", json={"step": step}), range(8)))
     assert {answer.status_code for answer in answers} == {200}
+
+
+def test_a_request_that_a_remembered_owner_may_have_served_is_not_sent_to_another_edge() -> None:
+    """It has made the decision, perhaps: only the client knows whether to send the request again."""
+    served: list[bytes] = []
+
+    async def owner(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while head := await reader.readuntil(b"\r\n\r\n"):
+            served.append(head)
+            if len(served) == 2:
+                writer.close()
+                return
+            writer.write(b"HTTP/1.1 200 OK\r\ncontent-length: 2\r\n\r\n{}")
+            await reader.readexactly(len(b'{"step":0}'))
+
+    with listening(owner) as url:
+        owners = Replies(Answer(421, [(b"location", f"{url}/decide".encode())], b"{}"))
+        with ingress(owners) as client:
+            answers = [client.post("/decide", json={"step": 0}).status_code for _ in range(2)]
+    assert (answers, len(served), owners.missions) == ([200, 503], 2, ["default"])
 
 
 def test_a_deeply_nested_body_is_for_its_owner_to_refuse() -> None:
