@@ -6,17 +6,24 @@ import asyncio
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
 import pytest
 from fastapi.responses import JSONResponse, Response
 
+from service.config.settings import Settings
+from service.llm.answers import Busy, Completion
+from service.llm.client import LLMClient
+from service.llm.embedded import EmbeddedServer
+from service.llm.request_bodies import WarmUp
+from service.llm.server import LlmServer, ServerStatus
 from service.llm.usability import CircuitBreaker
 from tests.support.missions import PAPER
 from tests.support.running import listening, serving
 from tests.support.stub_llm import FIRST, StubLlm, chat_completion, http_answer, misbehaving, silent, wait_for
-from tests.support.waiting import Gate, Striding, until
+from tests.support.waiting import Gate, Striding, soon, until
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -208,3 +215,49 @@ def test_a_server_that_refuses_the_first_question_may_still_answer_others(edge: 
         client = edge(mode="llm", llm_url=f"{url}/v1")
         wait_for(client, "ready")
         assert client.post("/decide", json=report()).json()["source"] == "llm"
+
+
+@pytest.mark.parametrize(("lists", "llm"), [(1, "unavailable"), (2, "ready")])
+async def test_the_silence_of_calls_for_one_uav_alone_opens_it(
+    monkeypatch: pytest.MonkeyPatch, lists: int, llm: str
+) -> None:
+    """A call for several takes longer, and its end by a deadline says nothing about calls for one."""
+
+    class Hanging(LLMClient):
+        async def complete(self, body: dict[str, Any], session: str | None = None) -> Completion:
+            asked.set()
+            await asyncio.Event().wait()
+            raise AssertionError
+
+    monkeypatch.setattr("service.llm.server.time", Striding(100.0))
+    server, asked = LlmServer(Settings(mode="llm"), WarmUp("", "", None)), asyncio.Event()
+    server.status, server.connection.client = ServerStatus("ready"), Hanging("http://localhost/v1")
+    for _ in range(3):
+        asked.clear()
+        call = asyncio.create_task(server.ask_labels("test", "", "", [["A", "B"]] * lists))
+        await asked.wait()
+        call.cancel()
+        await asyncio.gather(call, return_exceptions=True)
+    assert server.status.llm == llm
+    await server.close()
+
+
+async def test_a_server_that_asks_for_a_pause_while_it_starts_gets_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    pauses: list[float] = []
+
+    async def pause(seconds: float) -> None:
+        pauses.append(seconds)
+        await asyncio.Event().wait()
+
+    async def embed(settings: Settings) -> EmbeddedServer:
+        raise Busy("HTTP 503", 1060.0)
+
+    for module in ("answers", "server"):
+        monkeypatch.setattr(f"service.llm.{module}.time", Striding(0.0))
+    monkeypatch.setattr("service.llm.server.asyncio", SimpleNamespace(**{**vars(asyncio), "sleep": pause}))
+    server = LlmServer(Settings(mode="llm"), WarmUp("", "", None), embed=embed)
+    server.start()
+    await soon(lambda: pauses)
+    assert pauses == [60.0]
+    assert server.readiness().detail == "HTTP 503"
+    await server.close()

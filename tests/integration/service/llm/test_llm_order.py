@@ -14,6 +14,7 @@ from fastapi.responses import Response
 from pydantic import ValidationError
 
 from service.config.settings import Settings
+from service.llm.answers import NoDecision
 from service.llm.request_bodies import WarmUp
 from service.llm.server import ServerStatus
 from service.llm.server_pool import ServerPool
@@ -136,3 +137,16 @@ def test_a_header_names_the_mission_to_a_router(edge: Edge, report: Report, head
 def test_a_header_that_is_none_is_refused(name: str) -> None:
     with pytest.raises(ValidationError):
         Settings(llm_session_header=name)
+
+
+async def test_answers_that_come_too_late_do_not_degrade_a_server_and_unusable_ones_do() -> None:
+    servers = pool(URLS[:1])
+    for _ in range(6):
+        servers.record_usability("test", NoDecision("llm_timeout", "late"))
+    assert servers.statuses == {"ready": 1}
+    for _ in range(5):
+        servers.record_usability("test", NoDecision("answer_format", "cheese"))
+    assert servers.statuses == {"degraded": 1}
+    servers.record_usability("test", None)
+    assert servers.statuses == {"ready": 1}
+    await servers.close()

@@ -225,3 +225,24 @@ def test_a_refused_request_counts_against_the_server_that_refuses_it(edge: Edge,
         assert reasons == {"llm_status"}
         ready = client.get("/readyz").json()
         assert ready["model"] == "first" and ready["llm"] == "ready", ready
+
+
+@pytest.mark.usefixtures("left_alone")
+def test_a_server_that_is_silent_again_and_again_is_left_out_though_another_answers_for_it(
+    edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    async def hangs(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        asked.append("first")
+        await silent(reader, writer)
+
+    # By this clock, a cancelled call had longer than any deadline.
+    monkeypatch.setattr("service.llm.server.time", Striding(100.0))
+    with listening(misbehaving(hangs)) as first, serving(Named("second", "1 7", asked).app) as second:
+        client = edge(mode="llm", llm_url=f"{first}/v1,{second}/v1", hedge_ms=200)
+        standing_by(client, 1)
+        for step in range(5):
+            assert client.post("/decide", json=report(step=step)).json()["model"] == "second"
+        assert "aicvds_llm_breaker_opened_total 1.0" in client.get("/metrics").text
+    assert asked == ["first", "second"] * 3 + ["second"] * 2
