@@ -8,6 +8,9 @@ import sys
 
 import pytest
 
+from service.observability import logs
+from tests.integration.service.live.test_broadcaster import answer_of
+
 _CODE = r"""
 import logging, sys
 from service.observability import logs
@@ -38,3 +41,13 @@ def test_a_line_stays_a_line(form: str) -> None:
     else:
         # A traceback has its lines.
         assert lines[-1] == "ValueError: one" and len(lines) >= 5
+
+
+def test_a_decision_past_its_deadline_is_a_warning_and_one_at_its_deadline_is_not(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO")
+    for total_ms in (3000.0, 3000.5):
+        logs.decided(answer_of("a" * 32).model_copy(update={"latency_ms": {"total": total_ms}}), None)
+    found = [(record.levelname, record.getMessage()) for record in caplog.records]
+    assert found == [("INFO", "decision"), ("WARNING", "late decision")]

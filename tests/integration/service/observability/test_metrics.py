@@ -9,8 +9,10 @@ from typing import Any
 
 import httpx
 import pytest
+from prometheus_client import CollectorRegistry
 
-from service.observability.metrics import Metrics
+from service.observability.metrics import ArrayHistogram, Metrics
+from tests.integration.service.live.test_broadcaster import answer_of
 from tests.support.places import ROOT
 from tests.support.waiting import until
 
@@ -78,3 +80,43 @@ def test_the_docs_name_every_metric_with_its_labels() -> None:
     ]
     kinds = [(c._name, getattr(c, "_type", "histogram"), getattr(c, "_labelnames", ())) for c in collectors]
     assert named == {name + ends.get(kind, ""): (kind, list(labels)) for name, kind, labels in kinds}
+
+
+def test_a_decision_counts_with_its_lateness_its_overhead_and_its_tokens() -> None:
+    metrics = Metrics()
+
+    def found(name: str, **labels: str) -> float | None:
+        return metrics.registry.get_sample_value(name, labels)
+
+    timely = answer_of("a" * 32).model_copy(update={"latency_ms": {"llm": 2000.0, "total": 3000.0}})
+    usage = {"saved": 30, "server_prompt": 500, "cached": 400, "completion": 2}
+    late = timely.model_copy(
+        update={
+            "latency_ms": {"llm": 2500.0, "total": 3000.5},
+            "tokens": timely.tokens.model_copy(update=usage),
+            "source": "llm",
+            "reason": None,
+        }
+    )
+    uncached = late.model_copy(update={"tokens": late.tokens.model_copy(update={"cached": None, "completion": None})})
+    metrics.record_decision(timely, None)
+    assert found("aicvds_deadline_missed_total") == 0
+    assert found("aicvds_llm_tokens_total", kind="prompt") in (None, 0)
+    metrics.record_decision(late, None)
+    metrics.record_decision(uncached, None)
+    assert found("aicvds_deadline_missed_total") == 2
+    assert found("aicvds_overhead_seconds_sum") == pytest.approx(1.0 + 2 * 0.5005)
+    assert found("aicvds_decision_seconds_sum", stage="llm") == pytest.approx(7.0)
+    assert found("aicvds_decisions_total", source="value", reason="mode_value") == 1
+    assert found("aicvds_decisions_total", source="llm", reason="none") == 2
+    kinds = ("prompt", "cached", "completion")
+    assert [found("aicvds_llm_tokens_total", kind=kind) for kind in kinds] == [1000, 400, 2]
+    assert found("aicvds_tokens_saved_total") == 60
+
+
+def test_a_value_at_a_bound_is_in_the_bounds_bucket() -> None:
+    registry = CollectorRegistry()
+    ArrayHistogram("excess_db", "Excess", registry, (-1.0, 0.0, 1.0)).observe([-1.0, -0.5, 0.0, 1.0, 1.5])
+    found = [registry.get_sample_value("excess_db_bucket", {"le": le}) for le in ("-1.0", "0.0", "1.0", "+Inf")]
+    assert found == [1, 3, 4, 5]
+    assert (registry.get_sample_value("excess_db_count"), registry.get_sample_value("excess_db_sum")) == (5, 1.0)

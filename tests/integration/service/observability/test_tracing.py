@@ -14,7 +14,13 @@ import httpx
 import pytest
 from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
 from opentelemetry.proto.trace.v1.trace_pb2 import Span
+from opentelemetry.sdk.trace import TracerProvider
+from opentelemetry.sdk.trace.export import SimpleSpanProcessor
+from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 
+from service.config.settings import Settings
+from service.observability.tracing import Traces
+from tests.integration.service.live.test_broadcaster import answer_of
 from tests.support.processes import run, serving_edge
 from tests.support.running import listening, serving
 from tests.support.stub_llm import StubLlm, http_answer, misbehaving, wait_for
@@ -165,3 +171,24 @@ def test_a_log_that_nobody_reads_keeps_no_uav_waiting(report: Report) -> None:
         process.terminate()
         # Nor is the end waited for.
         assert process.wait(PATIENCE_S) in (0, -15)
+
+
+def test_the_spans_of_a_decision_follow_each_other_and_the_llms_has_its_server_and_tokens() -> None:
+    exporter, provider = InMemorySpanExporter(), TracerProvider()
+    provider.add_span_processor(SimpleSpanProcessor(exporter))
+    answer = answer_of("a" * 32)
+    tokens = answer.tokens.model_copy(update={"server_prompt": 500, "completion": 2})
+    stages = {"prompt": 10.0, "llm": 200.0, "store": 30.0, "total": 240.0}
+    answer = answer.model_copy(update={"latency_ms": stages, "tokens": tokens, "model": "m"})
+    for url, port in (("https://llm/v1", 443), ("http://llm/v1", 80), ("http://llm:8080/v1", 8080)):
+        exporter.clear()
+        Traces(provider, Settings(mode="llm", llm_url=url)).decided(answer)
+        spans = {span.name: span for span in exporter.get_finished_spans()}
+        times = [
+            (one.start_time or 0, one.end_time or 0) for one in map(spans.get, ("prompt", "chat m", "store")) if one
+        ]
+        assert [ended - began for began, ended in times] == [10_000_000, 200_000_000, 30_000_000]
+        assert [ended for _, ended in times[:2]] == [began for began, _ in times[1:]]
+        about = spans["chat m"].attributes or {}
+        assert (about["server.address"], about["server.port"]) == ("llm", port)
+        assert (about["gen_ai.usage.input_tokens"], about["gen_ai.usage.output_tokens"]) == (500, 2)
