@@ -104,3 +104,10 @@ def test_it_is_packed_only_for_who_unpacks_it(edge: Edge, accepted: str, packed:
     answer = client.get(PATH, headers={"Accept-Encoding": accepted})
     assert ("content-encoding" in answer.headers) is packed
     assert MissionAttention.model_validate_json(answer.content).mission_id == "test"
+
+
+def test_no_more_sensors_are_kept_than_there_are(edge: Edge) -> None:
+    client = edge()
+    scenario = {"name": "small", "sensors": 4, "uavs": 1}
+    client.put("/missions/test", json={"scenario": scenario, "top_k": 9}).raise_for_status()
+    assert client.get(PATH).json()["top_k"] == 4

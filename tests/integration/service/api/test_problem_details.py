@@ -8,6 +8,11 @@ from typing import Any
 
 import httpx
 import pytest
+from fastapi import FastAPI
+from starlette.testclient import TestClient
+
+from service.api.problem_details import install
+from service.errors import Misdirected
 
 Body = dict[str, Any]
 Report = Callable[..., Body]
@@ -153,3 +158,20 @@ def test_a_fault_is_told_in_plain_words(edge: Edge, path: str, body: object, sai
     assert refused.status_code == 422
     assert said in refused.json()["detail"]
     assert not any(words in refused.text for words in ("Value error", "Extra inputs", "valid dictionary"))
+
+
+def test_a_request_for_another_edges_mission_names_its_address_there_and_when_its_lease_has_ended() -> None:
+    app = FastAPI()
+    install(app)
+
+    @app.get("/missions/{mission_id}/guidance")
+    async def misdirected(mission_id: str) -> None:
+        owner = {"owned": "http://owner:8000", "unnamed": None}[mission_id]
+        raise Misdirected("mission_id", "another edge owns it", owner, 7.2 if owner else 0.0)
+
+    with TestClient(app, "http://localhost", follow_redirects=False) as client:
+        owned = client.get("/missions/owned/guidance?of=now")
+        unnamed = client.get("/missions/unnamed/guidance")
+    assert (owned.status_code, owned.json()["owner"], owned.headers["Retry-After"]) == (421, "http://owner:8000", "8")
+    assert owned.headers["Location"] == "http://owner:8000/missions/owned/guidance?of=now"
+    assert (unnamed.status_code, unnamed.headers["Retry-After"], "Location" in unnamed.headers) == (421, "1", False)

@@ -369,3 +369,12 @@ def test_only_the_uav_that_flew_a_decision_knows_its_outcome(edge: Edge, report:
     assert fields(refused) == ["outcome.decision_id"]
     assert client.post("/decide", json=report(step=1, outcome=outcome)).status_code == 200
     assert client.get("/missions/test").json()["feedback"] == 1
+
+
+def test_of_many_missions_two_hundred_are_listed_and_the_rest_counted_and_none_has_decided(edge: Edge) -> None:
+    client = edge()
+    for number in range(203):
+        assert client.put(f"/missions/m{number}", json={"mode": "policy"}).status_code == 200
+    listed = client.get("/missions").json()
+    assert [line["mission_id"] for line in listed["missions"]] == [f"m{number}" for number in range(202, 2, -1)]
+    assert (listed["more"], listed["newest"]) == (3, None)

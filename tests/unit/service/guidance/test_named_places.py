@@ -92,3 +92,20 @@ def test_sections_share_the_sensors_between_them() -> None:
     site = site_from_folder(EXAMPLE)
     sites = np.array(site.scenario.sites)
     assert in_ids("west, east", None, shapes, sites, ())[0] == "sensors 0, 1 and 2, sensors 12 and 13"
+
+
+def test_a_kilometre_means_the_sensors_at_the_same_place_near_the_line_and_is_doubted_far_from_them() -> None:
+    # 1,000 m along the line, 50 m and 51 m further, and 251 m beside it.
+    places, line = (
+        np.array([(1000.0, 250.0), (1050.0, 0.0), (1051.0, 0.0), (1000.0, 251.0)]),
+        [(0.0, 0.0), (5000.0, 0.0)],
+    )
+
+    def read_note(note: str) -> tuple[str, list[str]]:
+        return in_ids(note, None, [], places, line)
+
+    assert read_note("leak at km 1") == ("leak at sensors 0 and 1", [])
+    assert read_note("leak at km 1.301") == ("leak at sensors 1 and 2", [])
+    read, doubts = read_note("leak at km 1.302")
+    assert read == "leak at sensors 1 and 2"
+    assert doubts == ["“km 1.302” is read as sensors 1 and 2, the nearest, 251 m away along the line."]
