@@ -88,3 +88,7 @@ async def test_a_failure_is_a_fault_only_while_it_lasts(monkeypatch: pytest.Monk
     assert commits.fault == "the file was deleted"
     await soon(lambda: disk.written == ["a"] and not commits.failing)
     assert commits.fault is None
+    disk.faults.append(FULL)
+    commits.add(Deleted("b"))
+    assert not await commits.stored(60.0)
+    assert commits.failing and commits.fault is None
