@@ -8,6 +8,7 @@ The process ends when the socket is closed, after its last commit, even if the e
 so that it takes 17 MB and starts in a twentieth of a second.
 """
 
+import ctypes
 import os
 import select
 import signal
@@ -24,6 +25,10 @@ from urllib.parse import quote
 import msgpack
 
 LENGTH = struct.Struct("<I")
+# The numbers of Linux's system call `sched_setattr`, for which Python has no function, its argument, and the shortest
+# slice that Linux grants, in ns.
+_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
+_SCHED_ATTRIBUTES, _SLICE_NS = struct.Struct("IIQiIQQQ"), 100_000
 # Milliseconds that a transaction waits while another program has the file locked.
 BUSY_MS = 1000
 # WAL: readers and the writer do not wait for each other. FULL: a commit survives a power failure.
@@ -57,6 +62,18 @@ def _facts(file: str) -> Facts:
     except OSError:
         return (), (0, 0)
     return (found.st_dev, found.st_ino, found.st_nlink), (found.st_size, found.st_mtime_ns)
+
+
+def shorten_slice() -> None:
+    """Ask Linux (from 6.12 on) for short time slices: the shorter the slice, the sooner a process that wakes up runs.
+
+    Where threads of an LLM use all cores, a commit of a tenth of a millisecond else waits for their slices of 3 ms.
+    """
+    number = _SCHED_SETATTR.get(os.uname().machine)
+    if sys.platform == "linux" and number is not None and os.sched_getscheduler(0) == os.SCHED_OTHER:
+        nice = os.getpriority(os.PRIO_PROCESS, 0)
+        ordinary = _SCHED_ATTRIBUTES.pack(_SCHED_ATTRIBUTES.size, os.SCHED_OTHER, 0, nice, 0, _SLICE_NS, 0, 0)
+        ctypes.CDLL(None).syscall(number, 0, ordinary, 0)
 
 
 _CHANGED = "another program has changed the store's file: restart the edge"
@@ -191,6 +208,7 @@ def _displaced(file: str) -> Displaced:
 
 
 if __name__ == "__main__":
+    shorten_slice()
     # A terminal or a service manager sends these signals to the edge and to its children.
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import os
+import platform
 import signal
+import struct
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -67,6 +70,23 @@ def test_a_writer_that_is_killed_is_followed_by_another_and_nothing_is_lost(
     assert "the store fails" not in caplog.text
     with running(tmp_path / "m.db") as (client, _):
         assert client.get("/missions/test").json() == before
+
+
+def test_the_writer_has_short_time_slices_and_nothing_else_of_its_scheduling_changes(
+    tmp_path: Path, report: Report
+) -> None:
+    """Linux shows a process's slice from 6.12 on, and ignores the request for one before."""
+    with running(tmp_path / "m.db") as (client, _):
+        stored_decision(client, report())
+        (writer,) = writers(os.getpid())
+        attributes = ctypes.create_string_buffer(48)
+        # The system call `sched_getattr`.
+        number = {"x86_64": 315, "aarch64": 275}[platform.machine()]
+        assert ctypes.CDLL(None).syscall(number, writer.pid, attributes, 48, 0) == 0
+        _, policy, flags, nice, priority, slice_ns, _, _ = struct.unpack("IIQiIQQQ", attributes.raw)
+    assert (policy, flags, nice, priority) == (os.SCHED_OTHER, 0, os.getpriority(os.PRIO_PROCESS, 0), 0)
+    since = tuple(map(int, platform.release().split(".")[:2]))
+    assert slice_ns == (100_000 if since >= (6, 12) else 0)
 
 
 @pytest.mark.long
