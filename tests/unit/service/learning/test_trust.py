@@ -49,6 +49,7 @@ def test_who_is_silent_keeps_its_weight() -> None:
     advise(trust, {"value": 8.0, "policy": 0.0}, times=10)
     assert trust.weights["llm"] == 0.5
     assert trust.weights["policy"] > 0.45
+    assert sum(trust.weights.values()) == pytest.approx(1.0)
 
 
 def test_who_advised_what_failed_unexpectedly_is_trusted_less() -> None:
@@ -122,3 +123,33 @@ def test_a_state_of_other_advisers_is_ignored() -> None:
     trust = Trust(PRIOR)
     trust.load_state_dict(Trust({"llm": 0.9, "planner": 0.1}).state_dict())
     assert trust.weights == PRIOR
+
+
+def odds_after(prior: dict[str, float], flown: float, cost: float) -> float:
+    """The odds of the LLM against the policy, in units of those before, after one decision that cost this much."""
+    trust = Trust(prior)
+    before = trust.weights["llm"] / trust.weights["policy"]
+    trust.open["a" * 32] = Advice({"llm": 0.0, "policy": 0.0}, {"llm": flown, "policy": 0.0}, 0.0)
+    trust.settle("a" * 32, cost)
+    # Without the fixed share of a hundredth.
+    own = {name: weight - 0.01 * prior[name] for name, weight in trust.weights.items()}
+    return own["llm"] / own["policy"] / before
+
+
+@pytest.mark.parametrize(
+    ("llm", "flown", "factor"),
+    [(0.5, 1.0, 2.0), (0.25, 1.0, 4.0), (0.1, 1.0, 4.0), (0.1, 0.5, 2.0), (0.01, 0.25, 1.0)],
+)
+def test_a_surprise_counts_four_packets_and_its_factor_is_at_most_four(llm: float, flown: float, factor: float) -> None:
+    odds = odds_after({"llm": llm, "policy": 1.0 - llm}, flown, cost=0.25)
+    assert odds == pytest.approx(math.exp(-0.6 * factor * 4.0 * 0.25))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_loss_beyond_eight_packets_counts_as_eight(sign: float) -> None:
+    weights = []
+    for regret in (8.0, 80.0):
+        trust = Trust(PRIOR)
+        trust.update({"llm": sign * regret, "value": 0.0, "policy": 0.0}, dict.fromkeys(PRIOR, 0.0), 0.0)
+        weights.append(trust.weights)
+    assert weights[0] == weights[1] != PRIOR

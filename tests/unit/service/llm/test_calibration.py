@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Sequence
+
 import pytest
 
 from service.llm.answers import Completion, NoDecision, TokenPosition, raised
 from service.llm.calibration import LabelReader, calibrated, probabilities
+from tests.support.waiting import soon
 
 
 def completion(text: str, **first_token: float) -> Completion:
@@ -22,6 +26,11 @@ def test_calibration_takes_a_favourite_label_away() -> None:
     assert sum(corrected.values()) == pytest.approx(1.0)
     # What says no more than the bias says nothing.
     assert calibrated(bias, bias) == pytest.approx(dict.fromkeys("ABC", 1 / 3))
+
+
+def test_a_label_that_is_hardly_ever_drawn_gets_no_more_than_tenfold_its_uniform_weight() -> None:
+    corrected = calibrated({"A": 0.5, "B": 0.5}, {"A": 1.0, "B": 1e-9})
+    assert corrected["B"] / corrected["A"] == pytest.approx(20.0)
 
 
 def test_sharpened_probabilities_are_nearer_to_a_choice() -> None:
@@ -89,3 +98,57 @@ def test_a_bias_of_token_probabilities_corrects_no_answer_read_from_the_text() -
     reader._bias["model", "static", 1] = [{"A": 0.9, "B": 0.1}]
     other = Completion("A", None, None, None, (TokenPosition("A", {"x": 1.0}),), "model")
     assert reader.read(other, "static", [["A", "B"]]) == [pytest.approx({"A": 0.975, "B": 0.025})]
+
+
+def _measuring() -> bool:
+    return any(task.get_name() == "calibration" for task in asyncio.all_tasks())
+
+
+async def test_a_bias_that_cannot_be_measured_is_tried_three_times() -> None:
+    asked: list[str] = []
+
+    async def failing(static: str, text: str, lists: Sequence[Sequence[str]]) -> Completion:
+        asked.append(text)
+        raise NoDecision("llm_error", "no answer")
+
+    reader = LabelReader()
+    for count in range(1, 4):
+        reader.calibrate(failing, "model", "static", ["nothing"], [["A", "B"]])
+        await soon(lambda: not _measuring())
+        assert len(asked) == count
+    reader.calibrate(failing, "model", "static", ["nothing"], [["A", "B"]])
+    assert not _measuring()
+    # Another prompt's bias is another question.
+    reader.calibrate(failing, "model", "other", ["nothing"], [["A", "B"]])
+    assert _measuring()
+    await reader.close()
+
+
+@pytest.mark.parametrize(("models", "known"), [(("model", "model"), True), (("model", "other"), False)])
+async def test_a_bias_is_of_the_answers_of_one_model_only(models: tuple[str, str], known: bool) -> None:
+    answering = iter(models)
+
+    async def ask(static: str, text: str, lists: Sequence[Sequence[str]]) -> Completion:
+        return Completion("A", None, None, None, (TokenPosition("A", {"A": 0.8, "B": 0.2}),), next(answering))
+
+    reader = LabelReader()
+    reader.calibrate(ask, "model", "static", ["nothing", "N/A"], [["A", "B"]])
+    await soon(lambda: not _measuring())
+    assert reader.bias("model", "static") == ([pytest.approx({"A": 0.8, "B": 0.2})] if known else None)
+    assert reader.bias("other", "static") is None
+
+
+async def test_a_measurement_without_an_answer_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would else be the last one, of any model."""
+    monkeypatch.setattr("service.llm.calibration.TIMEOUT_S", 0.0)
+
+    async def silent(static: str, text: str, lists: Sequence[Sequence[str]]) -> Completion:
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    reader = LabelReader()
+    reader.calibrate(silent, "model", "static", ["nothing"], [["A", "B"]])
+    assert _measuring()
+    await soon(lambda: not _measuring())
+    assert reader.bias("model", "static") is None
+    await reader.close()

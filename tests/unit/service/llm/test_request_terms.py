@@ -42,6 +42,19 @@ def test_no_field_is_changed_twice_without_end() -> None:
     assert terms.applied({**body(), "seed": 1}).keys() == {"messages", "max_completion_tokens", "stream", "model"}
 
 
+def test_a_server_that_asks_for_more_tokens_again_gets_no_more() -> None:
+    """It would refuse the same request for ever."""
+    message = "max_output_tokens: integer below minimum value"
+    more = RequestTerms().after_refusal(message, body())
+    assert more == RequestTerms(more_tokens=256)
+    assert more.after_refusal(message, more.applied(body())) is None
+
+
+def test_terms_never_raise_the_number_of_token_probabilities() -> None:
+    few = label_body("m", "instructions", "state", "none", [["A", "B"]], "top_5")
+    assert RequestTerms(seed=False).applied(few)["top_logprobs"] == 5
+
+
 def test_usual_terms_leave_a_body_alone_and_others_leave_the_given_one() -> None:
     usual = chat_body("m", "instructions", "state", "none", [1], 15)
     assert RequestTerms().applied(usual) is usual
