@@ -74,3 +74,45 @@ def test_further_fields_are_a_json_object(monkeypatch: pytest.MonkeyPatch, text:
 def test_further_headers_are_printable(headers: dict[str, str]) -> None:
     with pytest.raises(ValidationError, match="printable ASCII"):
         Settings(llm_extra_headers=headers)
+
+
+@pytest.mark.parametrize(
+    ("name", "least", "most"),
+    [
+        ("deadline_ms", 10, 60_000),
+        ("planner_ms", 10, 60_000),
+        ("hedge_ms", 0, 60_000),
+        ("lease_s", 1.0, 300.0),
+        ("llm_load_s", 1.0, 3600.0),
+        ("llm_slots", 0, 10_000),
+        ("llm_concurrency", 1, 10_000),
+        ("llm_thinking_tokens", 0, 131_072),
+        ("max_requests", 1, 100_000),
+        ("max_body_bytes", 1_000, 1_000_000_000),
+        ("max_missions", 1, 1_000_000),
+        ("port", 0, 65_535),
+    ],
+)
+def test_a_number_out_of_its_bounds_is_refused(name: str, least: float, most: float) -> None:
+    for value in (least, most):
+        assert getattr(Settings(**{name: value}), name) == value
+    for value in (least - 1, most + 1):
+        with pytest.raises(ValidationError, match=name):
+            Settings(**{name: value})
+
+
+def test_an_empty_variable_is_an_unset_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("LLM_URL", "LLM_MODEL", "PORT", "KEYS", "EXPERIENCES"):
+        monkeypatch.setenv(f"AICVDS_{name}", "")
+    settings = Settings()
+    assert (settings.llm_url, settings.llm_model, settings.port) == (None, None, 8000)
+    assert (settings.keys, settings.experiences) == (None, None)
+
+
+def test_no_secret_shows() -> None:
+    settings = Settings(
+        llm_extra_headers={"api-key": "private-1"},
+        llm_extra_query={"code": "private-2"},
+        store="postgresql://me:private-3@host/missions",
+    )
+    assert "private" not in repr(settings) + str(settings)

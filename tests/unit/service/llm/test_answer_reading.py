@@ -156,3 +156,22 @@ def test_a_stream_may_have_any_separator_in_its_text() -> None:
     parts = [{"choices": [{"delta": {"content": text}}]} for text in ("0\u2028", "\u0085 7")]
     events = "".join(f"data: {json.dumps(part, ensure_ascii=False)}\r\n\r\n" for part in parts)
     assert completion_of(streamed(events.encode()), "url").text == "0\u2028\u0085 7"
+
+
+def test_a_probability_above_one_is_none() -> None:
+    likeliest = [{"token": "A", "prob": 1.5}, {"token": "B", "prob": 1.0}, {"token": "C", "prob": -0.1}]
+    read = completion_of(answer("B", logprobs={"content": [{"token": "B", "top_probs": likeliest}]}), "url")
+    assert read.positions[0].likeliest == {"B": 1.0}
+
+
+def test_no_more_tokens_are_cached_than_the_prompt_has() -> None:
+    usage = {"prompt_tokens": 300, "completion_tokens": 4, "prompt_tokens_details": {"cached_tokens": 512}}
+    read = completion_of({**answer("0 7"), "usage": usage}, "url")
+    assert (read.prompt_tokens, read.cached_tokens, read.completion_tokens) == (300, 300, 4)
+
+
+def test_of_two_tool_calls_none_is_the_answer() -> None:
+    calls = [{"function": {"arguments": f'{{"sensor_id": {sensor}, "velocity": 3}}'}} for sensor in (0, 1)]
+    assert "0" in completion_of({"choices": [{"message": {"tool_calls": calls[:1]}}]}, "url").text
+    with pytest.raises(NoDecision, match="a completion without text"):
+        completion_of({"choices": [{"message": {"tool_calls": calls}}]}, "url")
