@@ -311,7 +311,7 @@ def _sensors(text: str) -> list[int]:
         first = (
             sensors[-1] + 1 if sensors and re.search(r"-|to|through", text[end : number.begin]) else int(number.value)
         )
-        sensors += range(first, min(int(number.value), first + 999) + 1)
+        sensors += range(first, min(int(number.value), first + 1_999) + 1)
         end = number.end
     return sensors
 

@@ -9,9 +9,10 @@ from datetime import datetime
 import pytest
 
 from service.guidance import note_phrases
+from service.guidance.note_orders import BadOrders
 from service.guidance.note_phrases import PhrasedNote
-from shared.planning.orders import NO_GUIDANCE
-from shared.world.scenario import SCENARIOS
+from shared.planning.orders import NO_GUIDANCE, Guidance
+from shared.world.scenario import MAX_SENSORS, SCENARIOS
 
 PAPER = SCENARIOS["paper"]
 
@@ -122,3 +123,27 @@ def test_a_time_of_the_clock_is_the_next_one_in_the_zone_of_its_day(
     time_of_end = guidance.ends["max_velocity"].time
     assert doubts == [] and time_of_end is not None
     assert time_of_end.isoformat() == end
+
+
+@pytest.mark.parametrize("between", [", and", ". Fly"])
+def test_the_ends_of_two_near_velocities_are_kept_apart(between: str) -> None:
+    note = f"Fly at most 12 m/s until step 40{between} at least 10 m/s until step 60."
+    read, doubts = PhrasedNote(note, PAPER, ()).completed(NO_GUIDANCE, ())
+    assert (read.max_velocity, read.min_velocity, doubts) == (12, 10, [])
+    assert {name: end.step for name, end in read.ends.items()} == {"max_velocity": 40, "min_velocity": 60}
+
+
+@pytest.mark.parametrize("value", [9, 13])
+def test_a_limit_that_is_not_the_notes_velocity_is_no_reading(value: int) -> None:
+    note = PhrasedNote("It is windy, 11 m/s is plenty for them in this", PAPER, ())
+    assert note.completed(Guidance(max_velocity=11), (11.0,))[0] == Guidance(max_velocity=11)
+    with pytest.raises(BadOrders, match="unclear"):
+        note.completed(Guidance(max_velocity=value), (11.0,))
+
+
+def test_a_range_has_every_sensor_of_the_largest_network_and_is_bounded() -> None:
+    """A slip of the finger must not fill the memory."""
+    for last, least, most in ((1999, 1999, 1999), (9999, MAX_SENSORS, 2 * MAX_SENSORS)):
+        withdrawn = PhrasedNote(f"Cancel the visits to sensors 1-{last}.", PAPER, ["visit:4"]).withdrawn
+        assert least <= len(withdrawn) <= most
+        assert withdrawn[:3] == ["visit:1", "visit:2", "visit:3"]
