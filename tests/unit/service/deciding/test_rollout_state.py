@@ -8,7 +8,8 @@ import pytest
 from service.deciding.rollout_evaluator import evaluate
 from service.deciding.rollout_state import RolloutState
 from shared.belief.fleet_belief import FleetBelief
-from shared.world.scenario import SCENARIOS
+from shared.planning.orders import Guidance, SensorWish
+from shared.world.scenario import SCENARIOS, Scenario
 from shared.world.step_rule import Action
 
 PAPER = SCENARIOS["paper"]
@@ -64,3 +65,39 @@ def test_a_sensor_with_a_flat_battery_has_no_packets_to_lose() -> None:
 def test_a_candidate_whose_sensor_another_uav_has_reserved_fails() -> None:
     judged = evaluate(RolloutState.of(fleet(), PAPER, 4, 0, reserved={1}), [Action(0, 0), Action(1, 0)])
     assert judged.cost[1] >= 1.0 > judged.cost[0]
+
+
+def crowded(sensors: int = 80) -> tuple[FleetBelief, Scenario]:
+    """UAV 0 among more sensors than are simulated; the first is nearly empty and the others are full."""
+    scenario = PAPER.model_copy(update={"sensors": sensors})
+    belief = FleetBelief(scenario)
+    belief.advance(4)
+    x, y = belief.trajectory(0).at(0.0).tolist()
+    belief.locate(0, 4, (x, y), 0.0)
+    places = np.array([(x + 0.5 * n, y) for n in range(sensors)])
+    queue = np.full(sensors, CAPACITY)
+    queue[0] = 0.0
+    belief.hear(np.arange(sensors), places, np.full(sensors, 4), queue, np.full(sensors, 50.0))
+    return belief, scenario
+
+
+def test_of_too_many_sensors_those_with_a_visit_order_are_simulated_first() -> None:
+    belief, scenario = crowded()
+    ordered = Guidance(sensors=[SensorWish(sensor_id=0, visit_every=3)])
+    without = RolloutState.of(belief, scenario, 4, 0).sensors.tolist()
+    found = RolloutState.of(belief, scenario, 4, 0, guidance=ordered).sensors.tolist()
+    assert len(without) == len(found) == 64
+    assert 0 not in without
+    assert 0 in found
+
+
+@pytest.mark.parametrize(("uavs", "simulated"), [(2, 2), (5, 5), (12, 10)])
+def test_up_to_ten_uavs_are_simulated(uavs: int, simulated: int) -> None:
+    scenario = PAPER.model_copy(update={"uavs": uavs})
+    belief = FleetBelief(scenario)
+    belief.advance(4)
+    for uav in range(uavs):
+        belief.locate(uav, 4, tuple(belief.trajectory(uav).at(0.0).tolist()), 0.0)
+    state = RolloutState.of(belief, scenario, 4, 1)
+    assert 1 in state.links
+    assert len(state.links) == simulated
