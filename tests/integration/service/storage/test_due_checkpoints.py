@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+import asyncio
+from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from service.mission.events import Decided, Event, Reported, Settled
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.journal import EVENTS, Journal
+from service.storage.leases import LeaseLost
+from service.storage.operations import Change, Done
 from service.storage.store import StoredMission
 from shared.wire.schemas import MissionSpec, Outcome
 from shared.world.scenario import SCENARIOS
@@ -140,3 +143,35 @@ async def test_a_large_missions_checkpoint_replaces_no_event_that_came_while_it_
     assert written.state == {"step": 0}
     kept_now = store.load("test")
     assert kept_now is not None and kept_now.events == [REPORTED]
+
+
+class TakenOver:
+    """The writer of a store in which another edge has had the mission after these epochs."""
+
+    def __init__(self, *epochs: int) -> None:
+        self._epochs = epochs
+
+    def write(self, changes: Sequence[Change], done: Done) -> None:
+        lost = {("test", epoch) for epoch in self._epochs if any(change.epoch == epoch for change in changes)}
+        asyncio.get_running_loop().call_soon(done, LeaseLost(lost) if lost else None)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+@pytest.mark.parametrize(("epochs", "ended"), [((1,), []), ((1, 3), ["test"])])
+async def test_a_mission_taken_back_does_not_end_with_the_changes_of_its_earlier_lease(
+    store: StoreHere, monkeypatch: pytest.MonkeyPatch, epochs: tuple[int, ...], ended: list[str]
+) -> None:
+    monkeypatch.setattr(store, "writer", lambda: TakenOver(*epochs))
+    journal, lost = Journal(store, Metrics()), list[str]()
+    journal.on_lost = lost.append
+    earlier, mission = flown(), flown()
+    journal.begin(earlier, epoch=1)
+    journal.drop("test")
+    journal.resume(mission, 7, [], epoch=3)
+    mission.record(REPORTED)
+    assert await journal.stored(PATIENCE_S)
+    assert journal.lost(earlier)
+    assert (lost, journal.lost(mission)) == (ended, bool(ended))
+    assert await journal.close(PATIENCE_S)
