@@ -210,10 +210,28 @@ async def test_a_transaction_of_a_lost_mission_writes_nothing(store: Store) -> N
     assert store.missions() == []
     await commit_changes(writer, [Made("n", spec, resolved, 1)])
     assert (store.missions(), store.leases.unowned()) == (["n"], ["n"])
+    other = Leases(store._engine)
+    assert acquired(store.leases, "n") == 1
+    assert isinstance(acquired(other, "n"), LeaseHolder)
+    assert (store.leases.unowned(), other.unowned()) == (["n"], [])
     # Deletion ends the lease.
     await commit_changes(writer, [Deleted("n", 1)])
-    assert acquired(Leases(store._engine), "n") == 2
+    assert acquired(other, "n") == 2
     writer.close()
+
+
+async def test_a_stored_mission_is_unowned_for_all_but_its_owner_once_the_lease_ends(store: Store) -> None:
+    assert store.leases is not None
+    one, other, spec = store.leases, Leases(store._engine), MissionSpec()
+    acquired(one, "n")
+    writer = store.writer()
+    await commit_changes(writer, [Made("n", spec, ResolvedSpec.of(spec, Settings()), 1)])
+    writer.close()
+    assert (one.unowned(), other.unowned()) == (["n"], [])
+    expire(store)
+    assert (one.unowned(), other.unowned()) == (["n"], ["n"])
+    acquired(other, "n")
+    assert (one.unowned(), other.unowned()) == ([], ["n"])
 
 
 @contextmanager
