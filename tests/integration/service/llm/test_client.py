@@ -25,9 +25,7 @@ def completion(text: str, **choice: Any) -> Answer:
 
 
 @asynccontextmanager
-async def served(
-    answer: Callable[[dict[str, Any]], Answer], **client: Any
-) -> AsyncIterator[tuple[LLMClient, Asked]]:
+async def served(answer: Callable[[dict[str, Any]], Answer], **client: Any) -> AsyncIterator[tuple[LLMClient, Asked]]:
     """A client of a server that answers each body so, and the bodies."""
     asked: Asked = []
 

@@ -50,7 +50,7 @@ def flown(sensors: int = SMALL.sensors, name: str = "test") -> Mission:
 
 def decided(sensors: int | None) -> Decided:
     """A decision among this number of sensors; None: the modules had no part in it."""
-    sample = None if sensors is None else Sample(np.zeros((sensors, 4)), 0, np.zeros(4), 3)
+    sample = None if sensors is None else Sample(np.zeros((sensors, 4), np.float32), 0, np.zeros(4, np.float32), 3)
     return Decided(Pending("a" * 32, 0, 0, 1, 3, (), sample), 0, None)  # type: ignore[arg-type]
 
 
@@ -140,7 +140,7 @@ async def test_a_large_missions_checkpoint_replaces_no_event_that_came_while_it_
 
     written = await soon(kept)
     assert await journal.stored(PATIENCE_S)
-    assert written.state == {"step": 0}
+    assert written is not None and written.state == {"step": 0}
     kept_now = store.load("test")
     assert kept_now is not None and kept_now.events == [REPORTED]
 

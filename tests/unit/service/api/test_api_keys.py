@@ -10,6 +10,7 @@ import pytest
 from service.api import api_keys
 from service.api.api_keys import ApiKeys, BadKeys, KeyFile, editing
 from service.api.authentication import KeyAuthentication
+from service.commands.keys import main
 
 
 class Clock:
@@ -91,6 +92,13 @@ def test_a_file_has_no_more_keys_than_an_edge_reads(monkeypatch: pytest.MonkeyPa
         file.add(name, frozenset({"decide"}), 10)
     with pytest.raises(BadKeys, match="already 2 keys"):
         file.add("third", frozenset({"decide"}), 10)
+
+
+def test_a_key_may_only_decide_unless_more_is_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "keys.json"
+    assert main(["add", "fleet", "--file", str(path)]) == 0
+    [key] = KeyFile.read(path).keys
+    assert (set(key.scopes), key.per_minute, key.missions) == ({"decide"}, 6000, None)
 
 
 async def test_a_request_after_the_named_wait_is_answered_and_one_a_second_earlier_is_not(tmp_path: Path) -> None:
