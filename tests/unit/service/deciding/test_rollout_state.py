@@ -91,6 +91,15 @@ def test_of_too_many_sensors_those_with_a_visit_order_are_simulated_first() -> N
     assert 0 in found
 
 
+def test_many_candidates_are_evaluated_in_one_future_at_least() -> None:
+    belief, scenario = crowded()
+    state = RolloutState.of(belief, scenario, 4, 0)
+    every = [Action(sensor, velocity) for sensor in range(80) for velocity in range(scenario.max_velocity + 1)]
+    judged = evaluate(state, 3 * every)
+    assert len(judged.lost) == 3 * len(every)
+    assert np.isfinite(judged.lost).all() and np.isfinite(judged.cost).all()
+
+
 @pytest.mark.parametrize(("uavs", "simulated"), [(2, 2), (5, 5), (12, 10)])
 def test_up_to_ten_uavs_are_simulated(uavs: int, simulated: int) -> None:
     scenario = PAPER.model_copy(update={"uavs": uavs})
