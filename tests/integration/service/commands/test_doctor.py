@@ -12,6 +12,9 @@ from fastapi.responses import JSONResponse, Response
 
 from service.commands import banner, doctor
 from service.config.settings import Settings
+from service.llm.answers import Completion
+from service.llm.probing import Abilities, Examination
+from service.llm.request_bodies import WarmUp
 from service.storage.locks import FileLock
 from tests.support.running import serving
 from tests.support.stub_llm import StubLlm, chat_completion
@@ -179,3 +182,17 @@ def test_keys_without_a_key_and_a_missing_adapter_for_notes_are_in_the_way(
 def test_a_home_that_is_not_there_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/nonexistent/home")
     assert "MB of disk free" in doctor.planner(Settings(store="none")).found
+
+
+@pytest.mark.parametrize(("deadline_ms", "late"), [(4999, True), (5000, False)])
+def test_an_llm_that_misses_the_deadline_is_in_the_way(
+    monkeypatch: pytest.MonkeyPatch, deadline_ms: int, late: bool
+) -> None:
+    async def examined(settings: Settings, warm_up: WarmUp) -> Examination:
+        return Examination(Abilities("model"), "", Completion("A", 100, 40, 4), 5.0)
+
+    monkeypatch.setattr("service.llm.probing.examine", examined)
+    *_, last = doctor.llm_servers(Settings(llm_url="http://llm.example/v1", deadline_ms=deadline_ms))
+    assert ("AICVDS_DEADLINE_MS" in (last.remedy or "")) == late
+    # Of the prompt's tokens 40 were cached.
+    assert last.found.endswith("prompt 100 tokens (40 cached), answer 4, 13 a second")
