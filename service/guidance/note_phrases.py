@@ -5,10 +5,10 @@ The orders' adapter knows no withdrawals, and few ends. ``note_phrases.toml`` ha
 
 import re
 import tomllib
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from datetime import datetime, timedelta
 from fnmatch import filter as matching
-from functools import partial
+from functools import cache, partial
 from importlib.resources import files
 from typing import Any
 
@@ -20,21 +20,18 @@ from shared.world.scenario import Scenario
 
 _TABLE = tomllib.loads(files("service.guidance").joinpath("note_phrases.toml").read_text(encoding="utf-8"))
 _STOP = re.compile(r"[.;!?](?=\s|$)")
-_CLAUSE = re.compile(r"(?:[^.,;:!?]|[.,:](?=\S))+?(?=[.,;:!?](?:\s|$)| and | but | - |\n|$)")
+_CLAUSE = r"(?:[^.,;:!?]|[.,:](?=\S))+?(?=[.,;:!?](?:\s|$)| and | but | - |\n|$)"
 
 
+@cache
 def _pattern(phrase: str) -> re.Pattern[str]:
+    """The phrase's regular expression. To compile all takes a twentieth of the edge's start, so a first note does."""
     while (filled := re.sub(r"\{([a-zA-Z]+)\}", lambda part: _PARTS[part[1]], phrase)) != phrase:
         phrase = filled
     return re.compile(phrase)
 
 
 _PARTS: dict[str, str] = {**_TABLE["parts"], "words": "|".join([*CARDINALS[::-1], *ORDINALS])}
-_ROWS = {kind: [(row, [_pattern(p) for p in row["phrases"]]) for row in _TABLE[kind]] for kind in ("withdraw", "order")}
-_ENDS = {kind: [_pattern(phrase) for phrase in phrases] for kind, phrases in _TABLE["ends"].items()}
-_PHRASES = {
-    kind: [_pattern(phrase) for phrase in table["phrases"]] for kind, table in _TABLE.items() if "phrases" in table
-}
 _Matches = Iterator[re.Match[str]]
 
 
@@ -63,20 +60,20 @@ class PhrasedNote:
         self._once: dict[str, float] = {}
         self._ends: list[tuple[re.Match[str], str, End | None]] = []
         self._orders: list[tuple[str, re.Match[str]]] = []
-        for match in self._taken(_PHRASES["quoted"]):
+        for match in self._taken(_TABLE["quoted"]["phrases"]):
             self._quoted.append(re.sub(r",? (?:and|but)$", "", match[0].strip()))
-        for row, patterns in _ROWS["withdraw"]:
-            for match in self._taken(patterns, partial(self._withdraws, row, in_force)):
+        for row in _TABLE["withdraw"]:
+            for match in self._taken(row["phrases"], partial(self._withdraws, row, in_force)):
                 self.withdrawn += _names(row, match)
-        for match in self._taken(_PHRASES["once"]):
+        for match in self._taken(_TABLE["once"]["phrases"]):
             self._once |= {f"visit:{sensor}": 1 for sensor in _sensors(match["S"])}
-        for kind, patterns in _ENDS.items():
-            self._ends += [(match, kind, self._end(kind, match)) for match in self._taken(patterns)]
-        for match in self._taken(_PHRASES["times"]):
+        for kind, phrases in _TABLE["ends"].items():
+            self._ends += [(match, kind, self._end(kind, match)) for match in self._taken(phrases)]
+        for match in self._taken(_TABLE["times"]["phrases"]):
             self._doubts.append(f"In no order: “{match[0].strip()}”.")
-        list(self._taken(_PHRASES["added"]))
-        for row, patterns in _ROWS["order"]:
-            plain = self._taken(patterns, lambda match: not self._says("conditional", match))
+        list(self._taken(_TABLE["added"]["phrases"]))
+        for row in _TABLE["order"]:
+            plain = self._taken(row["phrases"], lambda match: not self._says("conditional", match))
             self._orders += [(row["means"], match) for match in plain]
         list(self._taken([_CLAUSE], self._is_chat))
 
@@ -145,7 +142,7 @@ class PhrasedNote:
         """The LLM's orders that its words may end or permit, or that no word gives to every sensor, with the words."""
         refused = {}
         text = re.sub(r"(?<=\d)(?:,| and|, and) (?=\d)", " ", self.rest)
-        clauses = [" ".join(clause[0].split()) for clause in _CLAUSE.finditer(text)]
+        clauses = [" ".join(clause[0].split()) for clause in re.finditer(_CLAUSE, text)]
         numbers = numbers_of(text)
         measures = [n for n in numbers if n.unit or not re.search(_TABLE["whose"]["words"], text[: n.begin])]
         step_s = self._scenario.step_s
@@ -187,9 +184,9 @@ class PhrasedNote:
                 refused |= dict.fromkeys(named, " ".join(self.rest.split()))
         return refused
 
-    def _taken(self, patterns: list[re.Pattern[str]], wanted: Callable[[re.Match[str]], bool] = bool) -> _Matches:
-        for pattern in patterns:
-            for match in filter(wanted, pattern.finditer(self.rest)):
+    def _taken(self, phrases: Iterable[str], wanted: Callable[[re.Match[str]], bool] = bool) -> _Matches:
+        for phrase in phrases:
+            for match in filter(wanted, _pattern(phrase).finditer(self.rest)):
                 self.rest = self.rest[: match.start()] + " " * len(match[0]) + self.rest[match.end() :]
                 yield match
 
@@ -260,7 +257,7 @@ class PhrasedNote:
         """
         stops = [0, *(stop.end() for stop in _STOP.finditer(self._lowered)), len(self._lowered)]
         sentence = (max(stop for stop in stops if stop <= at), min(stop for stop in stops if stop > at))
-        (apart,) = _PHRASES["apart"]
+        (apart,) = map(_pattern, _TABLE["apart"]["phrases"])
         begin = max((found.end() for found in apart.finditer(self._lowered, sentence[0], at)), default=sentence[0])
         ends = [match.span() for match, _, _ in self._ends]
         numbers = [n for n in numbers_of(self._lowered) if not any(begin <= n.begin < end for begin, end in ends)]
@@ -269,7 +266,7 @@ class PhrasedNote:
         return _uses(name, values[name], before) or not _uses(name, values[name], numbers)
 
     def _unread(self, values: Mapping[str, float], used: Collection[float]) -> Iterator[str]:
-        for clause in _CLAUSE.finditer(self.rest):
+        for clause in re.finditer(_CLAUSE, self.rest):
             numbers = [n for n in numbers_of(clause[0]) if clause[0][n.begin : n.end] not in ("one", "first", "second")]
             met = ("avoid",) if "min_velocity" in values else ()
             asked = [kind for kind, words in _TABLE["asks"].items() if kind not in met and re.search(words, clause[0])]
@@ -283,7 +280,7 @@ class PhrasedNote:
 
 
 def _has(kind: str, text: str) -> bool:
-    return any(pattern.search(text) for pattern in _PHRASES[kind])
+    return any(_pattern(phrase).search(text) for phrase in _TABLE[kind]["phrases"])
 
 
 def _uses(name: str, value: float, numbers: list[Number]) -> bool:
