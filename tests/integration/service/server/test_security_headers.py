@@ -20,6 +20,15 @@ async def refusing(scope: Scope, receive: Receive, send: Send) -> None:
     await send({"type": "http.response.body", "body": b""})
 
 
+@pytest.fixture
+def clock(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """The middleware's clock; its log is captured from INFO on."""
+    clock = Clock()
+    monkeypatch.setattr("service.server.middleware.time", clock)
+    caplog.set_level("INFO")
+    return clock
+
+
 def client() -> httpx.AsyncClient:
     return httpx.AsyncClient(transport=httpx.ASGITransport(SecurityHeaders(refusing)), base_url="http://localhost")
 
@@ -29,11 +38,8 @@ def logged(caplog: pytest.LogCaptureFixture) -> list[int]:
 
 
 async def test_of_one_status_the_first_refusal_of_a_minute_is_logged_and_each_that_has_a_trace(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    caplog: pytest.LogCaptureFixture, clock: Clock
 ) -> None:
-    clock = Clock()
-    monkeypatch.setattr("service.server.middleware.time", clock)
-    caplog.set_level("INFO")
     async with client() as http:
         for path, headers in (
             ("/404", {}),
@@ -51,11 +57,8 @@ async def test_of_one_status_the_first_refusal_of_a_minute_is_logged_and_each_th
 
 
 async def test_of_a_minute_no_more_than_sixty_refusals_are_logged(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    caplog: pytest.LogCaptureFixture, clock: Clock
 ) -> None:
-    clock = Clock()
-    monkeypatch.setattr("service.server.middleware.time", clock)
-    caplog.set_level("INFO")
     async with client() as http:
         for ahead_s in (0.0, 61.0):
             clock.ahead_s = ahead_s
