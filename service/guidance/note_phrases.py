@@ -25,7 +25,7 @@ _CLAUSE = r"(?:[^.,;:!?]|[.,:](?=\S))+?(?=[.,;:!?](?:\s|$)| and | but | - |\n|$)
 
 @cache
 def _pattern(phrase: str) -> re.Pattern[str]:
-    """The phrase's regular expression. To compile all takes a twentieth of the edge's start, so a first note does."""
+    """The phrase's regular expression. To compile all takes 60 ms, which a start without notes does not need."""
     while (filled := re.sub(r"\{([a-zA-Z]+)\}", lambda part: _PARTS[part[1]], phrase)) != phrase:
         phrase = filled
     return re.compile(phrase)

@@ -67,7 +67,7 @@ def _facts(file: str) -> Facts:
 def shorten_slice() -> None:
     """Ask Linux (from 6.12 on) for short time slices: the shorter the slice, the sooner a process that wakes up runs.
 
-    Where threads of an LLM use all cores, a commit of a tenth of a millisecond else waits for their slices of 3 ms.
+    Where threads of an LLM use all cores, a commit of a tenth of a millisecond else waits for their longer slices.
     """
     number = _SCHED_SETATTR.get(os.uname().machine)
     if sys.platform == "linux" and number is not None and os.sched_getscheduler(0) == os.SCHED_OTHER:

@@ -42,7 +42,7 @@ def test_a_decision_keeps_its_sample_to_the_bit_and_its_advice(report: AdviserRe
     read_sample = found.decision.sample
     for written, again in ((sample.features, read_sample.features), (sample.approach, read_sample.approach)):
         assert (again.dtype, again.shape, again.tobytes()) == (written.dtype, written.shape, written.tobytes())
-        # Training and the belief change what was restored.
+        # Training and the belief write into the restored arrays.
         assert again.flags.writeable
     assert (read_sample.chosen, read_sample.velocity) == (2, 7)
 
