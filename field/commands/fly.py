@@ -44,7 +44,7 @@ class Fly:
 
     It never arms, takes off, lands or sends a position: the path is the uploaded mission, and failsafes are the
     autopilot's. A UAV that a pilot or a failsafe flies, or that is off its path or outside the world's fence, gets no
-    command until it flies its mission again. Ctrl-C and SIGTERM leave the UAVs on their missions.
+    command until it flies its mission again. Ctrl-C, SIGTERM and SIGHUP leave the UAVs on their missions.
 
     Write the plans of a world in the folder `line`, and upload each with QGroundControl:
 
@@ -60,7 +60,7 @@ class Fly:
 
     Written to --out, as by `aicvds simulate`: summary.json, decisions.jsonl (one decision a line, written at once),
     report.html (open it in a browser) and requests.jsonl (for `aicvds replay`). The losses are those that the beacons
-    reported. Ctrl-C and SIGTERM still write the report of the steps flown. The environment variable AICVDS_API_KEY
+    reported. Ctrl-C, SIGTERM and SIGHUP still write the report. The environment variable AICVDS_API_KEY
     has the key for an edge that needs one. It needs the extra `mavlink`: pip install 'aic-vds[mavlink]'. Exit code: 0
     flown, 1 no vehicle, 2 bad use, 130 interrupted.
     """

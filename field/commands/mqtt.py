@@ -27,7 +27,7 @@ class Mqtt:
     docs/guides/lorawan.md, and examples/lorawan/lorawan.toml to begin with.
 
     The environment variable AICVDS_MQTT_PASSWORD has the broker user's password, and AICVDS_API_KEY a key of the edge
-    with the scope `readings`. Ends by SIGTERM or Ctrl-C. Exit code: 0 ended, 2 bad use.
+    with the scope `readings`. Ends by SIGTERM, SIGHUP or Ctrl-C. Exit code: 0 ended, 2 bad use.
     """
 
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
@@ -92,8 +92,9 @@ def _forward(configuration: "Configuration", options: Mqtt) -> int:
             return _refused(f"--metrics-port {options.metrics_port}: {error.strerror or error}")
     sender = EdgeSender(options.edge.rstrip("/"), os.environ.get(_API_KEY) or None, pending, metrics)
     ended = threading.Event()
-    for each in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(each, lambda *_: ended.set())
+    for each in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        if signal.getsignal(each) != signal.SIG_IGN:
+            signal.signal(each, lambda *_: ended.set())
     subscription.start()
     print(f"aicvds mqtt: {_in_words(configuration)}", file=sys.stderr, flush=True)
     pause_s = 0.0

@@ -22,6 +22,7 @@ from field.vehicles.radio import Radio
 from shared.client.edge_client import API_KEY, AsyncEdgeClient
 from shared.client.errors import EdgeError
 from shared.wire.schemas import Mode
+from simulator.commands.running import leave_terminal
 from simulator.errors import UsageError
 from simulator.records.decision import Decision
 from simulator.records.mission_logs import DecisionLog, RequestLog, with_edge_defaults
@@ -67,7 +68,7 @@ class FlightInterrupted(Exception):
 async def run_field_mission(job: FieldJob) -> RealFlight:
     """Connect to the vehicles, wait until they fly their missions, fly, and write the log as it happens.
 
-    SIGINT and SIGTERM end the flight after the present commands; vehicles that wait are sent on.
+    SIGINT, SIGTERM and SIGHUP end the flight after the present commands; vehicles that wait are sent on.
 
     Raises:
         UsageError: a connection, a vehicle's mission or the folder is unusable.
@@ -179,16 +180,21 @@ def print_line(text: str) -> None:
 
 @contextmanager
 def cancel_on_signals() -> Iterator[None]:
-    """Within the context SIGINT and SIGTERM cancel the present task."""
+    """Within the context SIGINT, SIGTERM and SIGHUP, unless ignored, cancel the present task."""
     loop, task = asyncio.get_running_loop(), asyncio.current_task()
     assert task is not None, "a coroutine runs in a task"
-    cancel: Callable[[], object] = task.cancel
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, cancel)
+
+    def cancel(number: int) -> None:
+        leave_terminal(number)
+        task.cancel()
+
+    numbers = [n for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) != signal.SIG_IGN]
+    for number in numbers:
+        loop.add_signal_handler(number, cancel, number)
     try:
         yield
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in numbers:
             loop.remove_signal_handler(number)
 
 

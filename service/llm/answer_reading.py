@@ -253,7 +253,8 @@ def _positions(choice: Any) -> tuple[TokenPosition, ...]:
     try:
         for position in choice["logprobs"]["content"][:_MAX_POSITIONS]:
             likeliest = _probabilities(position.get("top_logprobs") or position.get("top_probs") or [])
-            found.append(TokenPosition(str(position.get("token", "")).translate(_BLANKS), likeliest))
+            token = str(position.get("token", "")).translate(_BLANKS)
+            found.append(TokenPosition(token, likeliest, "top_probs" in position))
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
         pass
     return tuple(found) if any(position.likeliest for position in found) else ()
@@ -270,9 +271,7 @@ def _after_thoughts(positions: tuple[TokenPosition, ...]) -> tuple[TokenPosition
 
 def _probabilities(likeliest: Any) -> dict[str, float]:
     found: dict[str, float] = {}
-    for entry in likeliest[:_MAX_LIKELIEST]:
-        if not isinstance(entry, dict):
-            continue
+    for entry in [each for each in likeliest[:_MAX_LIKELIEST] if isinstance(each, dict)]:
         probability = entry["prob"] if "prob" in entry else math.exp(min(0.0, entry["logprob"]))
         # A NaN, in either field, is no probability.
         known = 0.0 <= probability <= 1.0 and not math.isnan(entry.get("logprob", 0.0))

@@ -59,10 +59,12 @@ class TokenPosition:
     Attributes:
         token: the token drawn there.
         likeliest: probabilities of the likeliest tokens there, without blanks around them.
+        after_sampling: whether they are from after the server's samplers, as llama.cpp's ``top_probs``.
     """
 
     token: str
     likeliest: dict[str, float]
+    after_sampling: bool = False
 
     def untempered(self, temperature: float) -> "TokenPosition":
         """The same with the probabilities at temperature 1: ``q^T``, renormalised."""

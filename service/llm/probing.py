@@ -11,6 +11,7 @@ import asyncio
 import logging
 import re
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -117,7 +118,8 @@ async def _probabilities(client: LLMClient, model: str | None, constraint: Const
         found = await _answer(
             client, label_body(model, "Answer in words.", _PROBE_TEXT, constraint, [["A", "B"]], kind)
         )
-        if found is not None and found.positions:
+        # llama-cpp-python's server obeys a grammar, but has no probabilities from after sampling.
+        if found is not None and found.positions and (found.positions[0].after_sampling or kind != "sampled"):
             return kind
     return "none"
 
@@ -128,15 +130,13 @@ async def _answers_lists(
     """Whether the server names a label of each of two lists, as only a constrained server does."""
     lists = [["A", "B"], ["C", "D"]]
     body = label_body(model, "Answer in words.", _PROBE_TEXT, constraint, lists, logprobs)
-    try:
+    found = None
+    with suppress(TimeoutError):
         async with asyncio.timeout(TOGETHER_TIMEOUT_S):
             found = await _answer(client, body)
-    except TimeoutError:
-        return False
-    try:
+    with suppress(NoDecision):
         return found is not None and bool(check_labels(found.text, lists))
-    except NoDecision:
-        return False
+    return False
 
 
 async def _asked(client: LLMClient, body: dict[str, Any]) -> Completion:
@@ -164,7 +164,10 @@ async def _listed_model(client: LLMClient) -> str | None:
     """The first listed model that may chat, else the first; None without a list. Raises :class:`Unreachable`."""
     try:
         names = await client.models()
-        return next((name for name in names if not _NO_CHAT.search(name)), names[0] if names else None)
+        names = [name for name in names if not _NO_CHAT.search(name)] or names
+        if len(names) > 1:
+            log.warning("of the listed models the first is used: %s; AICVDS_LLM_MODEL names another", names[:9])
+        return names[0] if names else None
     except Unreachable:
         raise
     except NoDecision as error:

@@ -31,8 +31,7 @@ _IDLE_MS = 1500
 _LIMITED = "SELECT set_config(name, '3000', false) FROM pg_settings WHERE name = 'transaction_timeout'"
 # An arbitrary key, which no other program of the same database may use.
 _MIGRATING = 0x41494356
-# Schemas of versions before the first release, whose missions this one cannot read.
-_UNRELEASED = ("0001", "0002", "0003", "0004")
+_SCHEMA_OF_FIRST_RELEASE = "0005"
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,10 +178,9 @@ def _version(db: sa.Connection) -> str | None:
     """The schema's version, None for an empty database; raises ``StoreUnusable`` if this program cannot read it."""
     known = sa.inspect(db).has_table("alembic_version")
     version: str | None = db.scalar(sa.text("SELECT version_num FROM alembic_version")) if known else None
-    if version is not None and version > SCHEMA:
-        raise StoreUnusable(f"it was made by a newer version of this program (schema {version}, not {SCHEMA})")
-    if version in _UNRELEASED:
-        raise StoreUnusable(f"it was made before the first release (schema {version}, not {SCHEMA})")
+    if version is not None and not _SCHEMA_OF_FIRST_RELEASE <= version <= SCHEMA:
+        made = "by a newer version of this program" if version > SCHEMA else "before the first release"
+        raise StoreUnusable(f"it was made {made} (schema {version}, not {SCHEMA})")
     return version
 
 

@@ -56,18 +56,24 @@ def _remedy(error: Exception) -> str:
     return ""
 
 
+_TERMINALS = [each for each in (1, 2) if os.isatty(each)]
+
+
+def leave_terminal(signum: int) -> None:
+    """After SIGHUP a line written to the terminal would be an error, and end what writes the result."""
+    for each in _TERMINALS if signum == getattr(signal, "SIGHUP", None) else ():
+        os.dup2(os.open(os.devnull, os.O_WRONLY), each)
+
+
 @contextmanager
 def ends_interrupt() -> Iterator[None]:
     """Within the context, SIGTERM and SIGHUP raise KeyboardInterrupt: they leave a result as Ctrl-C does.
 
     A signal that is ignored, as SIGHUP is under nohup, stays ignored.
     """
-    terminals = [each for each in (1, 2) if os.isatty(each)]
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
-        # After SIGHUP a line written to the terminal would be an error, and end what writes the result.
-        for each in terminals if signum != signal.SIGTERM else ():
-            os.dup2(os.open(os.devnull, os.O_WRONLY), each)
+        leave_terminal(signum)
         raise KeyboardInterrupt
 
     # Windows has no SIGHUP.

@@ -110,9 +110,12 @@ TOPICS = {
 
 
 @pytest.mark.parametrize(
-    ("server", "message"), [("chirpstack", chirpstack_up), ("the-things-stack", the_things_stack_up)]
+    ("server", "message", "end"),
+    [("chirpstack", chirpstack_up, signal.SIGTERM), ("the-things-stack", the_things_stack_up, signal.SIGHUP)],
 )
-def test_uplinks_reach_the_mission(tmp_path: Path, wide: httpx.Client, server: str, message: Message) -> None:
+def test_uplinks_reach_the_mission(
+    tmp_path: Path, wide: httpx.Client, server: str, message: Message, end: signal.Signals
+) -> None:
     metrics = free_port()
     with ExitStack() as stack:
         there = stack.enter_context(broker(tmp_path, "allow_anonymous true"))
@@ -138,7 +141,7 @@ def test_uplinks_reach_the_mission(tmp_path: Path, wide: httpx.Client, server: s
         for result in ("unknown_device", "no_queue", "unreadable"):
             assert told[f'aicvds_mqtt_uplinks_total{{result="{result}"}}'] == 1
         assert told["aicvds_mqtt_connected"] == 1
-        process.send_signal(signal.SIGTERM)
+        process.send_signal(end)
         assert process.wait(PATIENCE_S) == 0
 
 

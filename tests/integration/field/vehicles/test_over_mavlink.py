@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import signal
 import time
 from pathlib import Path
 
@@ -195,15 +196,16 @@ async def test_who_flies_the_vehicle(missions: list[list[Item]], port: int) -> N
             assert uav.landed and len(peer.commands()) == count
 
 
-def test_sigterm_leaves_the_vehicle_on_its_mission(
-    missions: list[list[Item]], port: int, edge: Edge, tmp_path: Path
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_the_vehicle_on_its_mission(
+    missions: list[list[Item]], port: int, edge: Edge, tmp_path: Path, end: signal.Signals
 ) -> None:
     with (
         pymavlink_peer(missions[2], port, speedup=20.0) as peer,
         started(*arguments(port, str(edge(mode="policy").base_url), tmp_path, "--uav", "2")) as process,
     ):
         output_until(process, r"step 2, UAV 2")
-        process.terminate()
+        process.send_signal(end)
         assert process.wait(60) == 130
         assert peer.airframe.mode == "mission"
     logged = read_logged_mission(tmp_path).decisions

@@ -290,6 +290,25 @@ def test_a_model_is_called_by_a_name_of_bounded_length(
         assert client.post("/decide", json=report()).json()["source"] == "llm"
 
 
+@pytest.mark.parametrize("second", ["decider", "nomic-embed-text"])
+def test_of_several_listed_models_the_first_is_used_and_the_log_names_all(
+    edge: Edge, caplog: pytest.LogCaptureFixture, second: str
+) -> None:
+    """vLLM lists its model before the model's adapters, and LiteLLM's proxy all that it serves."""
+    app = FastAPI()
+    app.get("/v1/models")(lambda: {"data": [{"id": "bare"}, {"id": second}]})
+    app.post("/v1/chat/completions")(Model("grammar").complete)
+    with serving(app) as url:
+        assert wait_for(edge(mode="llm", llm_url=f"{url}/v1"), "ready")["model"] == "bare"
+    warned = [line.getMessage() for line in caplog.records if "AICVDS_LLM_MODEL" in line.getMessage()]
+    # One of the two cannot chat, so there is no choice.
+    assert warned == (
+        ["of the listed models the first is used: ['bare', 'decider']; AICVDS_LLM_MODEL names another"]
+        if second == "decider"
+        else []
+    )
+
+
 def test_a_timed_out_call_is_hung_up(edge: Edge, report: Report) -> None:
     """The server learns at once that nobody waits any longer, and can free its slot."""
     hung_up = []
