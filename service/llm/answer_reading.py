@@ -43,8 +43,8 @@ _WRAPPED = re.compile(
     re.DOTALL,
 )
 # The beginning of an answer that was cut: of thoughts that the prompt opens (DeepSeek-R1, QwQ), or of JSON. A small
-# model that rambles would ramble on.
-_BEGUN = re.compile(r"\s*(?:(?:okay|alright|hmm+|first|let'?s|let me|we need|i need)\b|\{\s*\"[^}]*\Z)", re.IGNORECASE)
+# model that rambles, or adds blanks to its JSON without end, would go on.
+_BEGUN = re.compile(r"(?i)\s*(?:(?:okay|alright|hmm+|first|let'?s|let me|we need|i need)\b|\{\s*\"[^}]*(?<!\s{8})\Z)")
 # A fenced block's language.
 _LANGUAGE = re.compile(r"\A[a-zA-Z]+(?=\s*\n\s*\S|\s*[{\[\d])")
 # Kimi-VL writes its tags with triangles.

@@ -66,10 +66,6 @@ class TokenPosition:
     likeliest: dict[str, float]
     after_sampling: bool = False
 
-    def untempered(self, temperature: float) -> "TokenPosition":
-        """The same with the probabilities at temperature 1: ``q^T``, renormalised."""
-        return TokenPosition(self.token, raised(self.likeliest, temperature))
-
 
 def raised(probabilities: Mapping[str, float], exponent: float) -> dict[str, float]:
     """``p ** exponent``, renormalised: above 1 nearer to a choice of the likeliest. Empty if all are 0."""

@@ -100,9 +100,10 @@ async def _constraint(client: LLMClient, model: str | None) -> Constraint:
             except NoDecision as failed:
                 perhaps_busy = perhaps_busy or not isinstance(failed, NotUnderstood)
                 continue
-            if str(_PROBE_SENSOR) in text:
-                return constraint
             answered = True
+            with suppress(NoDecision):
+                check_answer(text, [_PROBE_SENSOR], _PROBE_VELOCITIES)
+                return constraint
         if not answered:
             await _asked(client, probe_body(model, "none"))
         if not perhaps_busy:

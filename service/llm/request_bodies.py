@@ -27,6 +27,8 @@ _SYSTEM_ROLE = re.compile(
 _TOO_FEW = re.compile(r"tokens.*(below minimum|>= ?\d|at least \d)|higher max_tokens", re.IGNORECASE | re.DOTALL)
 # Alibaba's thinking models answer in streams alone (supersonic 2355).
 _STREAMS_ONLY = re.compile(r"non-stream|stream ?= ?false|only supports? stream|stream mode", re.IGNORECASE)
+# Of an object that a small model spreads over lines, as SmolLM2 behind llama.cpp does with 62.
+_JSON_TOKENS = 128
 # Tokens of thought in addition to an answer, tried one after the other.
 _BUDGETS = (256, 1024, 4096, 16_384)
 
@@ -69,9 +71,8 @@ def chat_body(
     fields = constrain(constraint, sensor_ids, velocities)
     if constraint == "grammar":
         fields["cache_prompt"] = True
-    return _body(
-        model, [_message("system", system), _message("user", user)], 32 if constraint == "json_schema" else 12, fields
-    )
+    tokens = _JSON_TOKENS if constraint == "json_schema" else 12
+    return _body(model, [_message("system", system), _message("user", user)], tokens, fields)
 
 
 def label_body(
@@ -89,7 +90,7 @@ def label_body(
     grammar only after a first draw that violates it. The probabilities are among the labels then, and among all tokens
     otherwise, so the caller renormalises them. The probabilities of a later label depend on the labels drawn before it.
     So several labels are drawn at a low temperature, nearly always the likeliest, which
-    :meth:`TokenPosition.untempered` undoes.
+    :func:`service.llm.answers.raised` undoes.
     """
     fields = constrain_labels(constraint, lists)
     if constraint == "grammar":

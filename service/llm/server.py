@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from service.config.settings import Settings
 from service.llm.adapter_version import AdapterUnusable
-from service.llm.answers import Busy, Completion, NoDecision, NotUnderstood, Unreachable
+from service.llm.answers import Busy, Completion, NoDecision, NotUnderstood, Unreachable, raised
 from service.llm.connection import PROBE_TIMEOUT_S, Connection
 from service.llm.embedded import Embed, LoadFailed, embedded
 from service.llm.model_file import ModelMissing
@@ -202,8 +202,8 @@ class LlmServer:
         answer = await self._decide(mission_id, body, self._silence if len(lists) == 1 else None)
         if self.connection.abilities.logprobs != "sampled" or len(lists) == 1:
             return answer
-        positions = tuple(position.untempered(SEVERAL_LABELS_TEMPERATURE) for position in answer.positions)
-        return replace(answer, positions=positions)
+        plain = [replace(p, likeliest=raised(p.likeliest, SEVERAL_LABELS_TEMPERATURE)) for p in answer.positions]
+        return replace(answer, positions=tuple(plain))
 
     async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> Completion:
         """Call for a rewritten text.

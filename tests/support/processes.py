@@ -70,7 +70,7 @@ def _run_here(main: Callable[[], int], args: Sequence[str], env: Mapping[str, st
 def started(*args: str, **env: str) -> Iterator[subprocess.Popen[str]]:
     """A command in the background, killed at the end if it still runs."""
     # Under nohup the tests' own process ignores SIGHUP.
-    command = ["env", "--default-signal=HUP", AICVDS, *args]
+    command: list[str | Path] = ["env", "--default-signal=HUP", AICVDS, *args]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env={**os.environ, **env}
     )

@@ -374,27 +374,3 @@ def test_a_decision_that_takes_longer_than_the_deadline_is_warned_of(
         ready = wait_for(edge(mode="llm", llm_url=f"{url}/v1", deadline_ms=10), "ready")
     assert ready["decision_ms"] >= 50
     assert "LLM too slow: a decision took" in caplog.text
-
-
-class LlamaCppPython(StubLlm):
-    """llama-cpp-python's server, 0.3.36: a grammar is obeyed, the probabilities are from before it and all samplers."""
-
-    async def respond(self, body: Body, probed: bool) -> Response:
-        if not body.get("logprobs"):
-            return await super().respond(body, probed)
-        likeliest = [{"token": "H", "logprob": -2.3}, {"token": "B", "logprob": -3.0}, {"token": "A", "logprob": -3.9}]
-        position = {"token": "B", "logprob": -3.0, "bytes": None, "top_logprobs": likeliest}
-        return chat_completion("B", logprobs={"content": [position]})
-
-
-def test_probabilities_from_before_sampling_are_not_asked_for_as_those_after_it(edge: Edge, report: Report) -> None:
-    """The text would be a draw at temperature 1, where the likeliest label is wanted."""
-    server = LlamaCppPython()
-    with serving(server.app) as url:
-        client = edge(mode="guided", llm_url=f"{url}/v1")
-        ready = wait_for(client, "ready")
-        known = len(server.bodies)
-        assert client.post("/decide", json=report()).status_code == 200
-        until(lambda: len(server.bodies) > known)
-    assert "constrained by grammar, the 20 likeliest tokens" in ready["abilities"]
-    assert {(body["temperature"], body.get("post_sampling_probs")) for body in server.bodies[known:]} == {(0, None)}

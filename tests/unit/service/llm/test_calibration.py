@@ -83,8 +83,8 @@ def test_a_certain_answer_leaves_no_label_without_a_bias() -> None:
 def test_a_low_temperature_is_undone() -> None:
     p = {"A": 0.6, "B": 0.3, "C": 0.1}
     cooled = {label: value**5 / sum(v**5 for v in p.values()) for label, value in p.items()}
-    assert TokenPosition("A", cooled).untempered(0.2).likeliest == pytest.approx(p)
-    assert TokenPosition("A", {}).untempered(0.2).likeliest == {}
+    assert raised(cooled, 0.2) == pytest.approx(p)
+    assert raised({}, 0.2) == {}
 
 
 def test_labels_with_hardly_any_probability_are_no_answer() -> None:
