@@ -46,7 +46,7 @@ hypothesis.settings.load_profile("tests")
 # Set where the tests must be complete, as in CI: a test whose program is missing then fails.
 _COMPLETE = "TESTS_COMPLETE"
 # Programs from Debian's packages of the same names; the mark `needs` names a test's program.
-_PROGRAMS = ("chromium", "haproxy", "mosquitto", "prometheus")
+_PROGRAMS = ("chromium", "haproxy", "mosquitto", "pgbouncer", "prometheus")
 
 Edge = Callable[..., httpx.Client]
 

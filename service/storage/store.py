@@ -147,6 +147,8 @@ class Store:
     def _migrate(self) -> None:
         """Bring the schema up to date. alembic is slow to import, so an up-to-date store does without it."""
         with self._engine.connect() as db:
+            if self.leases is not None and db.scalar(sa.text("SHOW lock_timeout")) == "0":
+                raise StoreUnusable("a pooler drops the edge's time limits: set them for its role in PostgreSQL")
             if _version(db) == SCHEMA:
                 return
         from alembic import command
@@ -201,12 +203,14 @@ def _engine(url: str) -> sa.Engine:
         if not parsed.database or parsed.database == ":memory:":
             raise ValueError("a SQLite store is a file; for no store at all say none")
         engine = sa.create_engine(parsed, connect_args={"timeout": BUSY_MS / 1e3})
-        sa.event.listen(engine, "connect", _prepare)
+        sa.event.listen(engine, "connect", lambda db, _: [db.execute(f"PRAGMA {pragma}") for pragma in PRAGMAS])
         return engine
     if parsed.get_backend_name() != "postgresql":
         raise ValueError(f"{parsed.get_backend_name()} is not known: use a SQLite file or postgresql://")
     limits = {
         "connect_timeout": _CONNECT_S,
+        # Behind a pooler of transactions, a prepared statement of the same name may be another edge's.
+        "prepare_threshold": None,
         "tcp_user_timeout": _STATEMENT_MS,
         "options": f"-c lock_timeout={BUSY_MS} -c statement_timeout={_STATEMENT_MS} "
         f"-c idle_in_transaction_session_timeout={_IDLE_MS}",
@@ -214,11 +218,6 @@ def _engine(url: str) -> sa.Engine:
     engine = sa.create_engine(parsed, pool_pre_ping=True, connect_args={**limits, **parsed.query})
     sa.event.listen(engine, "connect", lambda db, _: (db.execute(_LIMITED), db.commit()))
     return engine
-
-
-def _prepare(connection: Any, _: object) -> None:
-    for pragma in PRAGMAS:
-        connection.execute(f"PRAGMA {pragma}")
 
 
 def cause(error: Exception) -> str:
