@@ -1,0 +1,53 @@
+"""A lease that another edge has had in the meantime is not this edge's any more, whatever its present epoch."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Collection
+from typing import cast
+
+import pytest
+
+from service.edge.ownership import LeasedOwnership
+from service.observability.metrics import Metrics
+from service.storage.leases import Leases
+
+
+class Database:
+    """Leases that this edge has under given epochs."""
+
+    def __init__(self, claimed: int, renewed: int) -> None:
+        self.claimed, self.renewed = claimed, renewed
+
+    def acquire(self, mission_id: str, address: str, term_s: float) -> int:
+        return self.claimed
+
+    def renew(self, term_s: float) -> dict[str, int]:
+        return {"m": self.renewed}
+
+    def taken(self, mission_ids: Collection[str]) -> set[str]:
+        return set()
+
+    def unowned(self) -> list[str]:
+        return []
+
+    def release(self) -> None:
+        """Nobody waits for it."""
+
+
+@pytest.mark.parametrize(("renewed", "owned"), [(1, True), (3, False)])
+async def test_a_lease_is_renewed_only_under_the_epoch_that_this_edge_knows(renewed: int, owned: bool) -> None:
+    found: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
+
+    def on_round(taken: set[str], unowned: list[str]) -> None:
+        if not found.done():
+            found.set_result(ownership.owns("m"))
+
+    ownership = LeasedOwnership(
+        cast("Leases", Database(claimed=1, renewed=renewed)), "http://here:1", 1.5, Metrics(), on_round
+    )
+    ownership.claim("m")
+    try:
+        assert await found is owned
+    finally:
+        ownership.close()
