@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pettingzoo import ParallelEnv  # type: ignore[import-untyped]
 
 from lab.marl.training_worlds import state_of
@@ -14,23 +15,59 @@ from shared.world.channel import path_loss_db
 from shared.world.scenario import SCENARIOS, Scenario
 from shared.world.trajectory import Trajectory, trajectories
 from simulator.world.environment import PipelineWorld
-from simulator.world.observation import Cost, Observation
+from simulator.world.observation import Info, Observation
 from simulator.world.truth import LARGEST_ERROR, LOSS_BOUNDS_DB, mean_only
 
 
 class PettingZooWorld(PipelineWorld, ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: ignore[misc]
-    """:class:`PipelineWorld` as a ``ParallelEnv`` with spaces; the action mask is in the infos."""
+    """:class:`PipelineWorld` as a ``ParallelEnv`` with spaces and an action mask.
+
+    ``info["action_mask"]``: flat int8, J entries for the sensors (1 for those heard at least once; all 1 if none was)
+    followed by ``max_velocity + 1`` ones.
+
+    Args:
+        cost: ``default``: the reward is :class:`PipelineWorld`'s. ``paper``: it is minus the paper's P_l of the step,
+            the sum of all f and all g, the same for every UAV.
+    """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "pipeline_v0", "render_modes": []}
     render_mode: str | None = None
 
-    def __init__(self, scenario: Scenario = SCENARIOS["paper"], *, cost: Cost = "default") -> None:
-        super().__init__(scenario, cost=cost)
+    def __init__(
+        self, scenario: Scenario = SCENARIOS["paper"], *, cost: Literal["default", "paper"] = "default"
+    ) -> None:
+        super().__init__(scenario)
+        self.cost = cost
         self.state_space = spaces.Box(-np.inf, np.inf, (1 + 2 * scenario.uavs + 4 * scenario.sensors,), np.float32)
         self._spaces = dict(
             zip(self.possible_agents, (_space(scenario, path) for path in trajectories(scenario)), strict=True)
         )
         self._actions = spaces.MultiDiscrete([scenario.sensors, scenario.max_velocity + 1])
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, Info]]:
+        """As :meth:`PipelineWorld.reset`."""
+        observations, infos = super().reset(seed, options)
+        return observations, self._masked(observations, infos)
+
+    def step(
+        self, actions: Mapping[str, ArrayLike]
+    ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, Info]]:
+        """As :meth:`PipelineWorld.step`."""
+        observations, rewards, terminations, truncations, infos = super().step(actions)
+        if self.cost == "paper":
+            rewards = dict.fromkeys(rewards, -float(self.tally[-1].events))
+        return observations, rewards, terminations, truncations, self._masked(observations, infos)
+
+    def _masked(self, observations: dict[str, Observation], infos: dict[str, Info]) -> dict[str, Info]:
+        """The infos with the action masks."""
+        velocities = np.ones(self.scenario.max_velocity + 1, dtype=np.int8)
+        masks = {}
+        for agent, observation in observations.items():
+            heard = observation["last_heard"] >= 0
+            masks[agent] = np.append(heard | ~heard.any(), velocities).astype(np.int8)
+        return {agent: cast(Info, {**info, "action_mask": masks[agent]}) for agent, info in infos.items()}
 
     def state(self) -> NDArray[np.float32]:
         """The true state for centralised critics, as :func:`~lab.marl.training_worlds.state_of` lays it out."""

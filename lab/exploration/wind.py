@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shared.planning.fleet_problem import FleetProblem
 from shared.world.channel import FloatArray, IntArray
-from simulator.bound.clairvoyant_bound import problem_with, replay, true_links, true_problem
+from simulator.bound.clairvoyant_bound import problem_with, replay, true_links
 from simulator.bound.solver import Budget, Plan, least_loss, plan
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld
@@ -41,9 +41,11 @@ def bound_in_wind(site: Site, seed: int, time_limit_s: float = 60.0) -> Plan:
 
 
 def problem_in_wind(world: PipelineWorld, steps: int | None = None) -> FleetProblem:
-    """:func:`true_problem` in the mean wind; without gusts, which :func:`velocities_towards` compensates."""
+    """The next steps in the mean wind; without gusts, which :func:`velocities_towards` compensates."""
     left = world.scenario.steps - len(world.tally)
-    return true_problem(world, steps, course(world, min(steps or left, left) * world.scenario.max_velocity + 1))
+    steps = min(steps or left, left)
+    sums, end = steps * world.scenario.max_velocity + 1, len(world.tally) + steps
+    return problem_with(world, end, world.scenario, true_links(world, end, course(world, sums)[:, None]))
 
 
 def relaxed_problem(world: PipelineWorld) -> FleetProblem:

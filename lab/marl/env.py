@@ -12,9 +12,9 @@ from torchrl.data import Binary, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
 from lab.marl.network_inputs import fleet_input, width
-from lab.marl.training_worlds import TrainingWorlds, state_of
+from lab.marl.training_worlds import TrainingWorlds, events_of, state_of
 from shared.world.scenario import Scenario
-from simulator.world.observation import Cost, Observation
+from simulator.world.observation import Observation
 
 
 class PipelineEnv(EnvBase):  # type: ignore[misc]
@@ -27,7 +27,7 @@ class PipelineEnv(EnvBase):  # type: ignore[misc]
     | ``agents, observation`` | ``(B, I, F)`` float32 | each UAV's, by :func:`lab.marl.network_inputs.actor_input` |
     | ``agents, action_mask`` | ``(B, I, J + V)`` bool | the slots and velocities allowed |
     | ``agents, action`` | ``(B, I, 2)`` int64 | slot of the sensor in the UAV's own order, velocity in m/s |
-    | ``agents, reward`` | ``(B, I, 1)`` float32 | minus the world's cost |
+    | ``agents, reward`` | ``(B, I, 1)`` float32 | minus the paper's P_l of the step |
     | ``state`` | ``(B, 1 + 2 I + 4 J)`` float32 | the true state, for a critic |
     | ``lost_packets`` | ``(B, 1)`` float32 | of the step, for the learning curve |
 
@@ -37,10 +37,10 @@ class PipelineEnv(EnvBase):  # type: ignore[misc]
 
     batch_locked = True
 
-    def __init__(self, scenario: Scenario, worlds: int, first_seed: int, cost: Cost) -> None:
+    def __init__(self, scenario: Scenario, worlds: int, first_seed: int) -> None:
         super().__init__(device="cpu", batch_size=[worlds])
         self.next_seed = first_seed
-        self._world = TrainingWorlds(scenario, cost=cost)
+        self._world = TrainingWorlds(scenario)
         self._order: NDArray[np.int64]
         uavs, choices = scenario.uavs, [scenario.sensors, scenario.max_velocity + 1]
         team = (worlds, uavs)
@@ -70,7 +70,8 @@ class PipelineEnv(EnvBase):  # type: ignore[misc]
         sensors = np.take_along_axis(self._order, action[..., :1], axis=-1)[..., 0]
         observation, outcome = self._world.step(sensors, action[..., 1])
         tensors = self._tensors(observation, outcome.lost_packets)
-        tensors["agents", "reward"] = torch.from_numpy(outcome.reward.astype(np.float32)[..., None])
+        loss = torch.from_numpy(events_of(outcome))
+        tensors["agents", "reward"] = -loss[:, None, None].expand(*action.shape[:2], 1)
         return tensors
 
     def _set_seed(self, seed: int | None) -> None:

@@ -55,7 +55,7 @@ class Madqn:
     def __init__(self, scenario: Scenario, episodes: int, first_seed: int) -> None:
         self._steps = scenario.steps
         self._split = [scenario.sensors, scenario.max_velocity + 1]
-        self._env = PipelineEnv(scenario, WORLDS, first_seed, cost="paper")
+        self._env = PipelineEnv(scenario, WORLDS, first_seed)
         online = two_heads(scenario)
         self._target = two_heads(scenario)
         choices = MultiOneHot(self._split)

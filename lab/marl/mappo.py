@@ -109,7 +109,7 @@ class Mappo:
         self._steps = scenario.steps
         self._last_seed = first_seed + episodes
         self._decay_rounds = min(DECAY_ROUNDS, max(1, episodes // WORLDS))
-        self._env = PipelineEnv(scenario, WORLDS, first_seed, cost="paper")
+        self._env = PipelineEnv(scenario, WORLDS, first_seed)
         self.network = two_heads(scenario)
         # With small last weights, the first draws are almost uniform whatever the features.
         last = self.network[-1]

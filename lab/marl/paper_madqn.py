@@ -27,7 +27,7 @@ from lab.marl.madqn import (
 )
 from lab.marl.networks import INDEPENDENT, IndependentAgents, plain_state, plain_width
 from lab.marl.training import Round
-from lab.marl.training_worlds import TrainingWorlds
+from lab.marl.training_worlds import TrainingWorlds, events_of
 from shared.world.scenario import Scenario
 
 _FIELDS = ("state", "choice", "reward", "following", "done")
@@ -83,7 +83,7 @@ class PaperMadqn:
 
     def __init__(self, scenario: Scenario, episodes: int, first_seed: int) -> None:
         self._scenario, self._next_seed = scenario, first_seed
-        self._worlds = TrainingWorlds(scenario, cost="paper")
+        self._worlds = TrainingWorlds(scenario)
         self._online, self._target = IndependentAgents(scenario), IndependentAgents(scenario)
         self._target.load_state_dict(self._online.state_dict())
         self._optimisers = [
@@ -117,13 +117,13 @@ class PaperMadqn:
             flown: NDArray[np.int64] = choices.numpy()
             observation, outcome = self._worlds.step(flown[..., 0], flown[..., 1])
             after = plain_state(scenario, observation)
-            rewards = torch.from_numpy(outcome.reward.astype(np.float32))
+            rewards = -torch.from_numpy(events_of(outcome))
             over = torch.full((WORLDS,), float(step == scenario.steps - 1))
             for uav, replay in enumerate(self._replays):
                 replay.add(
                     state=before[:, uav],
                     choice=choices[:, uav],
-                    reward=rewards[:, uav],
+                    reward=rewards,
                     following=after[:, uav],
                     done=over,
                 )

@@ -41,6 +41,11 @@ def state_of(worlds: VectorWorld) -> NDArray[np.float32]:
     return np.concatenate(parts, axis=1).astype(np.float32)
 
 
+def events_of(outcome: BatchStep) -> NDArray[np.float32]:
+    """The paper's P_l of each world, float32 ``(B,)``: failed transmissions plus overflowing sensors."""
+    return np.asarray(outcome.failed.sum(axis=1) + outcome.overflows, dtype=np.float32)
+
+
 class TrainingWorlds(VectorWorld):
     """:class:`VectorWorld` by seeds.
 

@@ -24,23 +24,13 @@ if TYPE_CHECKING:
 MOST_CHOICES = 6_000
 
 
-def true_problem(world: PipelineWorld, steps: int | None = None, progress_m: FloatArray | None = None) -> FleetProblem:
-    """The next steps, by default all that are left, from the world's present state.
-
-    Where the world differs from the model, ``links`` has the packets of the true links; a UAV that has departed has
-    none.
-
-    Args:
-        progress_m: the UAVs' progress after velocities that sum to 0, 1 and so on, ``(C, I)``; by default in still air.
-    """
-    end = world.scenario.steps if steps is None else min(len(world.tally) + steps, world.scenario.steps)
-    links = None
+def true_problem(world: PipelineWorld) -> FleetProblem:
+    """All steps that are left; where the world differs from the model, with the packets of the true links."""
+    scenario, links = world.scenario, None
     if world.truth.differs:
-        if progress_m is None:
-            sums = np.arange((end - len(world.tally)) * world.scenario.max_velocity + 1)
-            progress_m = world.fleet.progress_m + sums[:, None] * world.scenario.step_s
-        links = true_links(world, end, progress_m[:, None])
-    return problem_with(world, end, world.scenario, links)
+        sums = np.arange((scenario.steps - len(world.tally)) * scenario.max_velocity + 1)
+        links = true_links(world, scenario.steps, (world.fleet.progress_m + sums[:, None] * scenario.step_s)[:, None])
+    return problem_with(world, scenario.steps, scenario, links)
 
 
 def problem_with(world: PipelineWorld, end: int, scenario: Scenario, links: list[IntArray] | None) -> FleetProblem:

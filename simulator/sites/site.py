@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from simulator.sites.projection import Frame
     from simulator.world.environment import PipelineWorld
     from simulator.world.gain_trace import GainTrace
-    from simulator.world.observation import Cost
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +45,8 @@ class Site:
         """The spec with the site's names and map."""
         return spec.model_copy(update={"names": self.names, "map": list(self.map) or None})
 
-    def world(self, cost: Cost = "default") -> PipelineWorld:
+    def world(self) -> PipelineWorld:
         """A new world on this site."""
         from simulator.world.environment import PipelineWorld
 
-        return PipelineWorld(self.scenario, arrivals=self.arrivals, gains=self.gains, cost=cost)
+        return PipelineWorld(self.scenario, arrivals=self.arrivals, gains=self.gains)

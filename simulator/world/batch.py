@@ -12,7 +12,7 @@ from shared.world.scenario import SCENARIOS, Scenario
 from shared.world.step_rule import joules_a_packet, transfer
 from shared.world.trajectory import Trajectory, trajectories
 from simulator.world.gain_trace import GainTrace
-from simulator.world.observation import Cost, Observation, StepTally
+from simulator.world.observation import Observation, StepTally
 from simulator.world.sensors import Sensors, Streams
 from simulator.world.truth import Truth
 
@@ -61,7 +61,7 @@ class BatchStep:
         failed: f, ``(B, I)``.
         moved: packets collected by each UAV, ``(B, I)``.
         blamed: packets lost at the sensors with a usable link to the UAV, ``(B, I)``.
-        reward: minus the cost, ``(B, I)``.
+        cost: c, ``(B, I)``.
         overflows: sensors that overflowed, ``(B,)``.
         lost_packets: ``(B,)``.
         collected: packets collected from each sensor, ``(B, J)``.
@@ -70,7 +70,7 @@ class BatchStep:
     failed: IntArray
     moved: IntArray
     blamed: IntArray
-    reward: FloatArray
+    cost: FloatArray
     overflows: IntArray
     lost_packets: IntArray
     collected: IntArray
@@ -79,10 +79,6 @@ class BatchStep:
         """The step of one of the worlds."""
         failures, overflows = int(self.failed[world].sum()), int(self.overflows[world])
         return StepTally(step, failures, overflows, int(self.lost_packets[world]), self.collected[world])
-
-    def of_uavs(self, world: int) -> list[list[Any]]:
-        """One of the worlds' ``failed``, ``moved``, ``blamed`` and cost, by UAV."""
-        return [column[world].tolist() for column in (self.failed, self.moved, self.blamed, -self.reward)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,21 +123,12 @@ class VectorWorld:
 
     All worlds have the scenario's T steps and end together. The entries of an observation have leading dimensions
     ``(B, I)``; those of a UAV that left mean nothing. They are the world's own arrays, not copies, and are valid until
-    the next step. Attributes besides ``scenario`` and ``cost``: ``steps_flown``, and of the B worlds the true
-    ``sensors`` and the ``fleet``.
-
-    Args:
-        cost: the negative of the reward; see :class:`PipelineWorld`.
-
-    Raises:
-        ValueError: an unknown cost.
+    the next step. Attributes besides ``scenario``: ``steps_flown``, and of the B worlds the true ``sensors`` and the
+    ``fleet``.
     """
 
-    def __init__(self, scenario: Scenario = SCENARIOS["paper"], *, cost: Cost = "default") -> None:
-        if cost not in ("default", "paper"):
-            raise ValueError(f"unknown cost {cost!r}: choose one of default, paper")
+    def __init__(self, scenario: Scenario = SCENARIOS["paper"]) -> None:
         self.scenario = scenario
-        self.cost = cost
         self.steps_flown = 0
         self.sensors: Sensors
         self.fleet: Fleet
@@ -184,11 +171,8 @@ class VectorWorld:
         lost = ground.arrive(step, scenario.queue_capacity)
         blamed = np.matmul(links.hold, lost[:, :, None])[:, :, 0] * present
         overflows, lost_packets = np.add.reduce(lost > 0, axis=1), np.add.reduce(lost, axis=1)
-        if self.cost == "paper":
-            cost = (failed.sum(axis=1) + overflows).astype(np.float64)[:, None] * present
-        else:
-            cost = failed + blamed / scenario.queue_capacity
-        outcome = BatchStep(failed, moved, blamed, -cost, overflows, lost_packets, collected)
+        cost = failed + blamed / scenario.queue_capacity
+        outcome = BatchStep(failed, moved, blamed, cost, overflows, lost_packets, collected)
         status = np.zeros(links.distance_m.shape, dtype=np.bool_)
         status[(*self._rows, chosen)] = served
         return self._observe(position, links, status), outcome

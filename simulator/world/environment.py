@@ -10,7 +10,7 @@ from shared.world.channel import IntArray
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.world.batch import BatchStep, Draw, Fleet, VectorWorld, stacked
 from simulator.world.gain_trace import GainTrace
-from simulator.world.observation import Cost, Info, Observation, StepTally
+from simulator.world.observation import Info, Observation, StepTally
 from simulator.world.sensors import Sensors
 from simulator.world.truth import Truth
 
@@ -65,14 +65,12 @@ class PipelineWorld:
     nobody's ``lost_i``. A UAV that left neither flies, hears nor collects.
 
     ## Rewards
-    ``reward = -cost``. With ``cost="default"``, ``c_i = f_i + lost_i / W``, where ``lost_i`` are the packets lost in
-    this step at the sensors with a usable link to UAV i at its new position. With ``cost="paper"``, the paper's P_l:
-    the sum of all f and all g of this step, the same for every UAV.
+    ``reward = -c_i``, ``c_i = f_i + lost_i / W``, where ``lost_i`` are the packets lost in this step at the sensors
+    with a usable link to UAV i at its new position. ``tally`` has the paper's P_l of every step.
 
     ## Infos
-    ``action_mask``: flat int8, J entries for the sensors (1 for those heard at least once; all 1 if none was)
-    followed by ``max_velocity + 1`` ones. ``failed``: f. ``collected``: packets. ``lost_packets``: ``lost_i``.
-    ``cost``: as above. After ``reset`` the last four are ``False``, 0, 0 and 0.0.
+    ``failed``: f. ``collected``: packets. ``lost_packets``: ``lost_i``. ``cost``: c_i. After ``reset`` they are
+    ``False``, 0, 0 and 0.0.
 
     ## Start
     Positions, arrival rates, initial queues, start angles, all T x J arrivals and what the model leaves out are drawn
@@ -92,11 +90,10 @@ class PipelineWorld:
     Args:
         arrivals: a trace, shape ``(at least T, J)``, instead of drawn arrivals.
         gains: recorded excess losses, beside the drawn ones.
-        cost: the negative of the reward.
 
     Raises:
         ValueError: ``step`` before ``reset`` or after the end, without an action of a live agent, or with an action out
-            of bounds (the world does not change then); an unknown cost.
+            of bounds (the world does not change then).
     """
 
     def __init__(
@@ -105,7 +102,6 @@ class PipelineWorld:
         *,
         arrivals: IntArray | None = None,
         gains: GainTrace | None = None,
-        cost: Cost = "default",
     ) -> None:
         self.scenario = scenario
         self.arrivals = arrivals
@@ -116,7 +112,7 @@ class PipelineWorld:
         self.tally: list[StepTally] = []
         self.sensors: Sensors
         self.truth: Truth
-        self._worlds = VectorWorld(scenario, cost=cost)
+        self._worlds = VectorWorld(scenario)
         self._entropy: Any = None
         self._missions = 0
 
@@ -134,7 +130,7 @@ class PipelineWorld:
         self.sensors, self.truth = self._worlds.sensors.of(0), draw.truth
         self.tally = []
         self.agents = self.possible_agents[:]
-        return self._own(observed), self._infos(observed, None)
+        return self._own(observed), self._infos(None)
 
     def step(
         self, actions: Mapping[str, ArrayLike]
@@ -145,7 +141,7 @@ class PipelineWorld:
         chosen = checked_actions(actions, self.live, self.scenario)
         observed, outcome = self._worlds.fly(chosen[None, :, 0], chosen[None, :, 1])
         self.tally.append(outcome.tally(0, len(self.tally)))
-        observations, infos = self._own(observed), self._infos(observed, outcome)
+        observations, infos = self._own(observed), self._infos(outcome)
         rewards = {agent: -infos[agent]["cost"] for agent in self.agents}
         flown = len(self.tally)
         over, present = flown == self.scenario.steps, self.truth.faults.present(flown).tolist()
@@ -173,17 +169,13 @@ class PipelineWorld:
             for agent, uav in self.live.items()
         }
 
-    def _infos(self, observed: Observation, outcome: BatchStep | None) -> dict[str, Info]:
+    def _infos(self, outcome: BatchStep | None) -> dict[str, Info]:
         """The info of every live agent; without an outcome that of a reset."""
-        selectable = observed["last_heard"][0] >= 0
-        selectable |= ~selectable.any(axis=1, keepdims=True)
-        uavs, sensors = selectable.shape
-        mask = np.ones((uavs, sensors + self.scenario.max_velocity + 1), dtype=np.int8)
-        mask[:, :sensors] = selectable
-        failed, moved, blamed, cost = np.zeros((4, uavs)).tolist() if outcome is None else outcome.of_uavs(0)
+        nothing = np.zeros((4, 1, self.scenario.uavs))
+        columns = nothing if outcome is None else (outcome.failed, outcome.moved, outcome.blamed, outcome.cost)
+        failed, moved, blamed, cost = (column[0].tolist() for column in columns)
         return {
             agent: Info(
-                action_mask=mask[uav].copy(),
                 failed=bool(failed[uav]),
                 collected=int(moved[uav]),
                 lost_packets=int(blamed[uav]),

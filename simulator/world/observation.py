@@ -1,15 +1,10 @@
 """A UAV's observation of the world, its request to the edge, and the result of a step of the fleet."""
 
 from dataclasses import dataclass
-from typing import Any, Literal, TypedDict
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, TypedDict
 
 from shared.wire.schemas import DecideRequest, Outcome, SensorColumns
 from shared.world.channel import FloatArray, IntArray
-
-Cost = Literal["default", "paper"]
 
 
 class Observation(TypedDict):
@@ -28,7 +23,6 @@ class Observation(TypedDict):
 class Info(TypedDict):
     """The outcome of one UAV's last action; see :class:`~simulator.world.environment.PipelineWorld`."""
 
-    action_mask: NDArray[np.int8]
     failed: bool
     collected: int
     lost_packets: int

@@ -69,3 +69,19 @@ def test_state_is_laid_out_as_documented() -> None:
     np.testing.assert_allclose(state[5:11], [0.5, 0.5, 0.5, 0.7, 0.5, 0.9], rtol=1e-6)
     np.testing.assert_allclose(state[11:14], [0.0, 1.0, 1.0])
     np.testing.assert_allclose(state[14:], [0.98, 1.0, 1.0], rtol=1e-6)
+
+
+def test_the_mask_allows_the_sensors_heard_or_all() -> None:
+    _, infos = PettingZooWorld(SMALL).reset(seed=0)
+    assert infos["uav_0"]["action_mask"].tolist() == [1, 1, 0] + [1] * 15  # type: ignore[typeddict-item]
+    _, infos = PettingZooWorld(SMALL.model_copy(update={"pipeline": ((0.0, 0.0), (10.0, 0.0))})).reset(seed=0)
+    assert infos["uav_1"]["action_mask"].tolist() == [1] * 18  # type: ignore[typeddict-item]
+
+
+def test_paper_cost_is_the_teams_events() -> None:
+    world = PettingZooWorld(SMALL, cost="paper")
+    world.reset(seed=0)
+    world.sensors.arrivals[:] = (5, 7, 9)
+    _, rewards, _, _, infos = world.step({"uav_0": (0, 0), "uav_1": (2, 0)})
+    assert rewards == {"uav_0": -3.0, "uav_1": -3.0}
+    assert [infos[agent]["lost_packets"] for agent in world.agents] == [7, 7]

@@ -10,7 +10,6 @@ from torchrl.envs.utils import check_env_specs
 from lab.marl.env import PipelineEnv
 from lab.pettingzoo_world import PettingZooWorld
 from shared.world.scenario import Scenario
-from simulator.world.environment import PipelineWorld
 
 pytestmark = pytest.mark.long
 
@@ -18,11 +17,11 @@ SMALL = Scenario(name="small", sensors=4, uavs=2, steps=5)
 
 
 def test_it_keeps_its_own_specs() -> None:
-    check_env_specs(PipelineEnv(SMALL, worlds=3, first_seed=7, cost="paper"))
+    check_env_specs(PipelineEnv(SMALL, worlds=3, first_seed=7))
 
 
 def test_each_reset_draws_the_next_worlds() -> None:
-    env = PipelineEnv(SMALL, worlds=2, first_seed=7, cost="paper")
+    env = PipelineEnv(SMALL, worlds=2, first_seed=7)
     first, second = env.reset()["state"], env.reset()["state"]
     for state, seed in zip((*first, *second), (7, 8, 9, 10), strict=True):
         world = PettingZooWorld(SMALL)
@@ -31,7 +30,7 @@ def test_each_reset_draws_the_next_worlds() -> None:
 
 
 def test_an_action_names_a_slot_and_the_reward_is_the_worlds() -> None:
-    env, world = PipelineEnv(SMALL, worlds=1, first_seed=3, cost="paper"), PipelineWorld(SMALL, cost="paper")
+    env, world = PipelineEnv(SMALL, worlds=1, first_seed=3), PettingZooWorld(SMALL, cost="paper")
     seen = env.reset()
     world.reset(seed=3)
     for step in range(SMALL.steps):

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.marl.training_worlds import TrainingWorlds, state_of
+from lab.marl.training_worlds import TrainingWorlds, events_of, state_of
 from lab.pettingzoo_world import PettingZooWorld
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.world.observation import Cost
 
 ROUTES = Scenario(
     name="routes",
@@ -43,17 +42,12 @@ def same(batched: dict[str, Any], world: int, single: dict[str, Any]) -> None:
             np.testing.assert_array_equal(batched[key][world, uav], value, err_msg=f"{key} of UAV {uav}", strict=True)
 
 
-@pytest.mark.parametrize(
-    ("scenario", "cost"),
-    # The cost changes the reward alone.
-    [*((world, "default") for world in WORLDS), (SCENARIOS["paper"], "paper"), (DEAD, "paper")],
-    ids=lambda part: part.name if isinstance(part, Scenario) else part,
-)
-def test_every_number_is_that_of_the_single_world(scenario: Scenario, cost: Cost) -> None:
+@pytest.mark.parametrize("scenario", WORLDS, ids=lambda part: part.name)
+def test_every_number_is_that_of_the_single_world(scenario: Scenario) -> None:
     seeds = range(3) if scenario.sensors < 50 else range(2)
-    batch = TrainingWorlds(scenario, cost=cost)
+    batch = TrainingWorlds(scenario)
     observation: Any = batch.reset(seeds)
-    singles = [PettingZooWorld(scenario, cost=cost) for _ in seeds]
+    singles = [PettingZooWorld(scenario) for _ in seeds]
     for index, (seed, world) in enumerate(zip(seeds, singles, strict=True)):
         same(observation, index, world.reset(seed=seed)[0])
     sensors, velocities = actions_of(scenario, seeds)
@@ -65,7 +59,8 @@ def test_every_number_is_that_of_the_single_world(scenario: Scenario, cost: Cost
             same(observation, index, alone)
             tally = world.tally[-1]
             of_all: Any = {f"uav_{uav}": GONE for uav in range(scenario.uavs)} | infos
-            assert outcome.reward[index].tolist() == [rewards.get(agent, 0.0) for agent in of_all]
+            assert outcome.cost[index].tolist() == [-rewards.get(agent, -0.0) for agent in of_all]
+            assert events_of(outcome)[index] == tally.events
             assert outcome.failed[index].tolist() == [info["failed"] for info in of_all.values()]
             assert outcome.moved[index].tolist() == [info["collected"] for info in of_all.values()]
             assert outcome.blamed[index].tolist() == [info["lost_packets"] for info in of_all.values()]
@@ -93,12 +88,10 @@ def test_a_world_does_not_depend_on_its_neighbours() -> None:
     for step in range(30):
         _, of_five = five.step(sensors[step], velocities[step])
         _, of_two = two.step(sensors[step][[3, 1]], velocities[step][[3, 1]])
-        assert of_five.reward[[3, 1]].tolist() == of_two.reward.tolist()
+        assert of_five.cost[[3, 1]].tolist() == of_two.cost.tolist()
 
 
 def test_bad_use_is_refused_and_changes_nothing() -> None:
-    with pytest.raises(ValueError, match="unknown cost 'events': choose one of default, paper"):
-        TrainingWorlds(cost="events")  # type: ignore[arg-type]
     batch = TrainingWorlds(Scenario(name="short", steps=1))
     idle = np.zeros((2, 3), dtype=np.int64)
     with pytest.raises(ValueError, match="step before reset"):

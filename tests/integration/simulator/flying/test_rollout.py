@@ -21,7 +21,7 @@ from simulator.flying.pilots import EdgePilot, LocalPilot
 from simulator.policies.registry import POLICY_NAMES, policy_named
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld
-from simulator.world.observation import Cost, Observation
+from simulator.world.observation import Observation
 from tests.support.edge_stub import stub_edge
 
 
@@ -110,8 +110,8 @@ class Watched(Site):
 
     made: list[PipelineWorld] = field(default_factory=list)
 
-    def world(self, cost: Cost = "default") -> PipelineWorld:
-        self.made.append(super().world(cost))
+    def world(self) -> PipelineWorld:
+        self.made.append(super().world())
         return self.made[-1]
 
 
