@@ -1,6 +1,7 @@
 """One edge: it resolves a request's mission, decides, makes the answer durable, and reports it."""
 
 import asyncio
+import math
 import time
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -62,12 +63,17 @@ class Engine:
         self.pipeline = Pipeline(settings, self.queries, counter)
         self._batches = BatchDecider(self.pipeline, self.queries)
         self.journal: Journal | NullJournal = NullJournal() if store is None else Journal(store, metrics)
+        self.journal.on_recovery = self._recovered
         self._feedback = Feedback(metrics, self.journal, self.live)
         self.missions = MissionRegistry(settings, metrics, self.journal, store, self._loaded, self.live.forget)
 
     def _loaded(self, mission: Mission) -> None:
         self.live.watch.restored(mission)
         self.compiler.compile(mission)
+
+    def _recovered(self) -> None:
+        work = self._feedback.checkpoint_all(self.missions.loaded, math.inf)
+        self._recovery = asyncio.create_task(work, name="checkpoints")
 
     def hurry(self) -> None:
         """Prepare to close: queries to the LLM end within seconds, and pages get no more updates."""
@@ -86,7 +92,7 @@ class Engine:
         self._feedback.finish()
         await self.pipeline.close()
         self.missions.close()
-        await self._feedback.close(self.missions.loaded, _LAST_CHECKPOINTS_S)
+        await self._feedback.checkpoint_all(self.missions.loaded, _LAST_CHECKPOINTS_S)
         ended = await self.journal.close(_LAST_COMMIT_S)
         if ended:
             await self.missions.release()

@@ -101,8 +101,8 @@ class Feedback:
         """Finish all waiting training now."""
         self._training.finish()
 
-    async def close(self, missions: list[Mission], within_s: float) -> None:
-        """Write a checkpoint of every mission while there is time; the journal has the events of the others."""
+    async def checkpoint_all(self, missions: list[Mission], within_s: float) -> None:
+        """Write a checkpoint of every changed mission while there is time; the journal has the others' events."""
         ends = time.monotonic() + within_s
         for mission in missions:
             if time.monotonic() >= ends:

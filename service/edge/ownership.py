@@ -120,7 +120,7 @@ class LeasedOwnership:
             sqlalchemy.exc.SQLAlchemyError: the database fails.
         """
         asked_at = time.monotonic()
-        answer = self._leases.acquire(mission_id, self._address, self._term_s)
+        answer = self._leases.acquire(mission_id, self._address, self._term_s, self.epoch(mission_id) or 1)
         if isinstance(answer, LeaseHolder):
             self._leased.pop(mission_id, None)
             raise _misdirected(mission_id, answer)
@@ -167,8 +167,8 @@ class LeasedOwnership:
         for mission_id, lease in leases.items():
             # The next request for the mission of an ended lease takes it again, unless another edge has it by then.
             lease.until = asked_at + self._term_s if renewed.get(mission_id) == lease.epoch else 0.0
-        ended = [mission_id for mission_id, lease in leases.items() if not lease.until]
-        taken = self._leases.taken(ended) if ended else set[str]()
+        ended = {(mission_id, lease.epoch) for mission_id, lease in leases.items() if not lease.until}
+        taken = {mission_id for mission_id, _ in self._leases.lost(ended)} if ended else set[str]()
         unowned = self._leases.unowned()
         self._renewed_at = asked_at
         if self._failure is not None:

@@ -56,11 +56,15 @@ class GroupCommit:
     Args:
         on_lost: called with the ID and lost epoch of a mission that another edge has taken over, before any request
             that waits for its changes is answered.
+        on_recovery: called after the first success that follows failures.
     """
 
-    def __init__(self, writer: Writer, metrics: Metrics, on_lost: Callable[[str, int], None]) -> None:
+    def __init__(
+        self, writer: Writer, metrics: Metrics, on_lost: Callable[[str, int], None], on_recovery: Callable[[], None]
+    ) -> None:
         self._writer = writer
         self._on_lost = on_lost
+        self._on_recovery = on_recovery
         self._metrics = metrics
         self._loop = asyncio.get_running_loop()
         self._state = _CommitState.IDLE
@@ -247,6 +251,7 @@ class GroupCommit:
     def _recover(self) -> None:
         log.warning("the store works again")
         self._failure, self._lasting, self._pause_s = None, False, _FIRST_PAUSE_S
+        self._on_recovery()
 
     def _fail(self, error: Exception) -> None:
         self._metrics.store_failures.inc()

@@ -56,6 +56,7 @@ class NullJournal:
     """The journal of an edge without a store: missions live as long as the process."""
 
     failing, fault = False, None
+    on_recovery: Callable[[], None]
 
     def begin(self, mission: Mission, epoch: int = 0) -> None:
         """Ignore a new mission."""
@@ -86,12 +87,14 @@ class Journal:
     Attributes:
         stored: as :meth:`GroupCommit.stored`. Afterwards :meth:`lost` says whether the changes were dropped instead.
         on_lost: called with the ID of a mission that another edge has taken over.
+        on_recovery: called when a checkpoint of every mission is due, because the database may have gone back.
     """
 
     def __init__(self, store: Store, metrics: Metrics) -> None:
-        self._commits = GroupCommit(store.writer(), metrics, self._lose)
+        self._commits = GroupCommit(store.writer(), metrics, self._lose, self.recovered)
         self.stored = self._commits.stored
         self.on_lost: Callable[[str], None] = lambda _: None
+        self.on_recovery: Callable[[], None] = lambda: None
         self._loop = asyncio.get_running_loop()
         self._logs: dict[str, MissionLog] = {}
         self._lost = BoundedDict[tuple[str, int], bool](_MOST_LOST)
@@ -176,6 +179,13 @@ class Journal:
         self._lost[mission_id, epoch] = True
         if self.epoch(mission_id) == epoch:
             self.on_lost(mission_id)
+
+    def recovered(self) -> None:
+        """The store works again. It may be another, which lacks transactions: all that is in memory becomes due."""
+        for mission_log in self._logs.values():
+            mission, mission_log.since_checkpoint = mission_log.mission, EVENTS
+            self._commits.add(Made(mission.mission_id, mission.requested_spec, mission.spec, mission_log.epoch))
+        self.on_recovery()
 
     def due(self, mission: Mission, least: int = EVENTS) -> MissionLog | None:
         """The log of a mission with at least this many events since its last checkpoint; resets the count."""

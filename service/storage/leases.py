@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 # clock_timestamp() gives the time after the row is locked; the statement may have waited for the lock.
 _ACQUIRE = sa.text("""
     INSERT INTO leases AS held (mission_id, owner, address, epoch, expires_at)
-    VALUES (:mission_id, :owner, :address, 1, clock_timestamp() + :term_s * interval '1 second')
+    VALUES (:mission_id, :owner, :address, :known, clock_timestamp() + :term_s * interval '1 second')
     ON CONFLICT (mission_id) DO UPDATE
     SET owner = excluded.owner, address = excluded.address,
-        epoch = held.epoch + (held.owner <> excluded.owner)::int,
+        epoch = greatest(held.epoch + (held.owner <> excluded.owner)::int, excluded.epoch),
         expires_at = clock_timestamp() + :term_s * interval '1 second'
     WHERE held.owner = excluded.owner OR held.expires_at <= clock_timestamp()
     RETURNING epoch
@@ -49,7 +49,6 @@ _RENEW = sa.text(f"""{_HELD}
 _RELEASE = sa.text(f"""{_HELD}
     UPDATE leases SET expires_at = clock_timestamp() FROM held WHERE leases.mission_id = held.mission_id
 """)
-_FOREIGN = sa.text("SELECT mission_id FROM leases WHERE mission_id = ANY(:mission_ids) AND owner <> :owner")
 _UNOWNED = sa.text("""
     SELECT mission_id FROM missions WHERE NOT EXISTS (
         SELECT 1 FROM leases
@@ -64,7 +63,19 @@ _FENCE = """
         WHERE owner = %s ORDER BY mission_id FOR SHARE OF leases
     ) AS held
 """
-_OWN = sa.text("SELECT mission_id, epoch FROM leases WHERE mission_id = ANY(:mission_ids) AND owner = :owner")
+_NEWER = sa.text("""
+    SELECT written.mission_id, written.epoch FROM leases
+    JOIN unnest(CAST(:names AS text[]), CAST(:epochs AS bigint[])) AS written (mission_id, epoch) USING (mission_id)
+    WHERE leases.epoch > written.epoch OR leases.epoch = written.epoch AND owner <> :owner
+""")
+_RESTORE = sa.text("""
+    INSERT INTO leases AS held (mission_id, owner, address, epoch, expires_at)
+    SELECT mission_id, :owner, '', epoch, clock_timestamp()
+    FROM unnest(CAST(:names AS text[]), CAST(:epochs AS bigint[])) AS known (mission_id, epoch) ORDER BY mission_id
+    ON CONFLICT (mission_id) DO UPDATE
+    SET owner = excluded.owner, address = '', epoch = excluded.epoch, expires_at = clock_timestamp()
+    WHERE held.epoch < excluded.epoch
+""")
 
 
 class LeaseLost(Exception):
@@ -97,7 +108,7 @@ class Leases:
         self._engine = engine
         self._owner = str(uuid.uuid4())
 
-    def acquire(self, mission_id: str, address: str, term_s: float) -> int | LeaseHolder:
+    def acquire(self, mission_id: str, address: str, term_s: float, known: int = 1) -> int | LeaseHolder:
         """Take a lease that is free or has ended; returns its epoch, or its holder.
 
         An owner whose lease has ended gets it again with the same epoch, unless another owner has had it.
@@ -105,8 +116,9 @@ class Leases:
         Args:
             address: where clients reach this edge.
             term_s: seconds until the lease ends.
+            known: the epoch of this owner's last lease, which a database that has gone back may lack.
         """
-        new = {"mission_id": mission_id, "owner": self._owner, "address": address, "term_s": term_s}
+        new = {"mission_id": mission_id, "owner": self._owner, "address": address, "term_s": term_s, "known": known}
         with self._autocommit() as db:
             epoch = db.scalar(_ACQUIRE, new)
             if epoch is not None:
@@ -133,11 +145,6 @@ class Leases:
         with self._autocommit() as db:
             db.execute(_RELEASE, {"owner": self._owner})
 
-    def taken(self, mission_ids: Collection[str]) -> set[str]:
-        """The missions that other owners have taken over."""
-        with self._autocommit() as db:
-            return set(db.scalars(_FOREIGN, {"mission_ids": list(mission_ids), "owner": self._owner}))
-
     def unowned(self) -> list[str]:
         """The IDs of all stored missions that no other edge owns."""
         with self._autocommit() as db:
@@ -157,11 +164,18 @@ class Leases:
         db.execute(_FENCE, (len(missions), list(names), list(epochs), self._owner))
 
     def lost(self, missions: Collection[tuple[str, int]]) -> set[tuple[str, int]]:
-        """The missions and epochs whose lease another owner has taken over."""
-        names = [mission_id for mission_id, _ in missions]
+        """The missions and epochs whose lease another owner has taken over.
+
+        A lease that is missing, or has a smaller epoch, was never lost: the database has gone back, as where a standby
+        lacks the last transactions. Where nothing is lost, such leases are made anew; they have ended.
+        """
+        names, epochs = zip(*missions, strict=True)
+        written = {"names": list(names), "epochs": list(epochs), "owner": self._owner}
         with self._autocommit() as db:
-            rows = db.execute(_OWN, {"mission_ids": names, "owner": self._owner}).all()
-        return set(missions) - {(row.mission_id, row.epoch) for row in rows}
+            lost = {(row.mission_id, row.epoch) for row in db.execute(_NEWER, written)}
+            if not lost:
+                db.execute(_RESTORE, written)
+        return lost
 
     @contextmanager
     def _autocommit(self) -> Iterator[sa.Connection]:

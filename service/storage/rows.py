@@ -105,10 +105,9 @@ class Statements:
         put = put.on_conflict_do_update(index_elements=["mission_id"], set_=newer)
         of: sa.BindParameter[str] = sa.bindparam("of")
         until: sa.BindParameter[int] = sa.bindparam("until")
-        self._made, self._entry = (
-            self._compiled(_conflict_fails(insert(table), key), *table.c.keys())
-            for table, key in ((missions, 1), (journal, 2))
-        )
+        # A mission that is there stays: it is made anew where a database may have gone back.
+        self._made = self._compiled(insert(missions).on_conflict_do_nothing(), *missions.c.keys())
+        self._entry = self._compiled(_conflict_fails(insert(journal)), *journal.c.keys())
         self._checkpoint = self._compiled(put, *checkpoints.c.keys())
         covered = sa.delete(journal).where((journal.c.mission_id == of) & (journal.c.seq <= until))
         self._covered = self._compiled(covered, "of", "until")
@@ -153,12 +152,11 @@ class Statements:
         return _Compiled(sql, None if self._dialect.positional else names)
 
 
-def _conflict_fails(put: Any, key: int) -> Any:
-    """An insert that ignores a row of the same first ``key`` columns, the primary key, and fails where bytes differ."""
-    names = put.table.c.keys()
-    differ = sa.or_(*(put.table.c[name] != put.excluded[name] for name in names[key:]))
-    # The last column must not be null.
-    return put.on_conflict_do_update(index_elements=names[:key], set_={names[-1]: sa.null()}, where=differ)
+def _conflict_fails(put: Any) -> Any:
+    """An insert that ignores an event that is there, and fails where its bytes differ."""
+    differ = sa.or_(journal.c.kind != put.excluded.kind, journal.c.body != put.excluded.body)
+    # The body must not be null.
+    return put.on_conflict_do_update(index_elements=["mission_id", "seq"], set_={"body": sa.null()}, where=differ)
 
 
 def encode(event: Event) -> tuple[Kind, bytes]:

@@ -32,6 +32,8 @@ _LIMITED = "SELECT set_config(name, '3000', false) FROM pg_settings WHERE name =
 # An arbitrary key, which no other program of the same database may use.
 _MIGRATING = 0x41494356
 _SCHEMA_OF_FIRST_RELEASE = "0005"
+# The address is not repeated: any part of it may be part of a password.
+_NO_ADDRESS = "is no address: write @, : and / in a password as %40, %3A and %2F"
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,21 +161,16 @@ class Store:
         config.set_main_option("path_separator", "os")
         with self._engine.begin() as db:
             if self.leases is not None:
-                self._lock_migration(db)
+                try:
+                    db.execute(sa.select(sa.func.pg_advisory_xact_lock(_MIGRATING)))
+                except sa.exc.OperationalError as error:
+                    if "lock timeout" not in str(error):
+                        raise
+                    raise StoreUnusable("another edge has migrated the database for too long: end it") from None
             # Another edge may have migrated meanwhile.
             if _version(db) != SCHEMA:
                 config.attributes["connection"] = db
                 command.upgrade(config, "head")
-
-    def _lock_migration(self, db: sa.Connection) -> None:
-        """Lock the migration; raises ``StoreUnusable`` if another edge migrates for too long."""
-        try:
-            db.execute(sa.select(sa.func.pg_advisory_xact_lock(_MIGRATING)))
-        except sa.exc.OperationalError as error:
-            if "lock timeout" not in str(error):
-                raise
-            database = self._engine.url.database
-            raise StoreUnusable(f"another edge has migrated the database {database} for too long: end it") from None
 
 
 def _version(db: sa.Connection) -> str | None:
@@ -187,26 +184,38 @@ def _version(db: sa.Connection) -> str | None:
 
 
 def _engine(url: str) -> sa.Engine:
-    if "://" not in url:
+    scheme, is_url, address = url.partition("://")
+    if scheme in ("postgresql", "postgres", "postgresql+psycopg"):
+        return _postgresql(f"postgresql://{address}")
+    if not is_url:
         Path(url).expanduser().parent.mkdir(parents=True, exist_ok=True)
         url = f"sqlite:///{Path(url).expanduser()}"
     try:
         parsed = sa.make_url(url)
     except (sa.exc.ArgumentError, ValueError):
-        # The text is not repeated: any part of it may be part of a password.
-        raise ValueError("is no address: write @, : and / in a password as %40, %3A and %2F") from None
-    if "@" in (parsed.host or ""):
-        raise ValueError("names a host with an @: write @ in a password as %40")
-    if parsed.drivername in ("postgresql", "postgres"):
-        parsed = parsed.set(drivername="postgresql+psycopg")
-    if parsed.get_backend_name() == "sqlite":
-        if not parsed.database or parsed.database == ":memory:":
-            raise ValueError("a SQLite store is a file; for no store at all say none")
-        engine = sa.create_engine(parsed, connect_args={"timeout": BUSY_MS / 1e3})
-        sa.event.listen(engine, "connect", lambda db, _: [db.execute(f"PRAGMA {pragma}") for pragma in PRAGMAS])
-        return engine
-    if parsed.get_backend_name() != "postgresql":
+        raise ValueError(_NO_ADDRESS) from None
+    if parsed.get_backend_name() != "sqlite":
         raise ValueError(f"{parsed.get_backend_name()} is not known: use a SQLite file or postgresql://")
+    if not parsed.database or parsed.database == ":memory:":
+        raise ValueError("a SQLite store is a file; for no store at all say none")
+    engine = sa.create_engine(parsed, connect_args={"timeout": BUSY_MS / 1e3})
+    sa.event.listen(engine, "connect", lambda db, _: [db.execute(f"PRAGMA {pragma}") for pragma in PRAGMAS])
+    return engine
+
+
+def _postgresql(url: str) -> sa.Engine:
+    """An engine for a URL as PostgreSQL's own programs read it: with several hosts, for example."""
+    from psycopg import ProgrammingError
+    from psycopg.conninfo import conninfo_to_dict
+
+    try:
+        address = conninfo_to_dict(url)
+    except ProgrammingError as error:
+        unknown = str(error).startswith("invalid URI query parameter")
+        raise ValueError(str(error).strip() if unknown else _NO_ADDRESS) from None
+    places = [str(address.get(name, "")) for name in ("host", "port", "dbname")]
+    if "@" in "".join(places) or (not places[1].replace(",", "0").isdecimal() and places[1]):
+        raise ValueError(_NO_ADDRESS)
     limits = {
         "connect_timeout": _CONNECT_S,
         # Behind a pooler of transactions, a prepared statement of the same name may be another edge's.
@@ -215,7 +224,7 @@ def _engine(url: str) -> sa.Engine:
         "options": f"-c lock_timeout={BUSY_MS} -c statement_timeout={_STATEMENT_MS} "
         f"-c idle_in_transaction_session_timeout={_IDLE_MS}",
     }
-    engine = sa.create_engine(parsed, pool_pre_ping=True, connect_args={**limits, **parsed.query})
+    engine = sa.create_engine("postgresql+psycopg://", pool_pre_ping=True, connect_args={**limits, **address})
     sa.event.listen(engine, "connect", lambda db, _: (db.execute(_LIMITED), db.commit()))
     return engine
 

@@ -293,10 +293,11 @@ async def test_other_bytes_of_the_same_event_are_an_error(
     await commit_changes(writer, right)
     # A repeated event with the same bytes does no harm.
     await commit_changes(writer, right)
-    for other in (made("test", epoch, seed=7), Entry("test", 1, GuidanceChanged({"note": "b"}), epoch)):
-        with pytest.raises(Exception) as failed:
-            await commit_changes(writer, [other])
-        assert cause(failed.value).startswith("another program has written other events of the same mission: ")
+    # A mission that is there stays as it was made.
+    await commit_changes(writer, [made("test", epoch, seed=7)])
+    with pytest.raises(Exception) as failed:
+        await commit_changes(writer, [Entry("test", 1, GuidanceChanged({"note": "b"}), epoch)])
+    assert cause(failed.value).startswith("another program has written other events of the same mission: ")
     kept = store.load("test")
     assert kept is not None
     assert (kept.events, kept.asked_for) == ([GuidanceChanged({"note": "a"})], MissionSpec())

@@ -81,11 +81,34 @@ def test_a_lease_is_taken_over_only_once_it_has_ended(store: Store, edges: tuple
     refused = acquired(other)
     assert isinstance(refused, LeaseHolder)
     assert refused.address == "http://one:1" and TERM_S - 60 < refused.left_s <= TERM_S
-    assert one.taken(["m"]) == set()
+    assert one.lost([("m", 1)]) == set()
     expire(store)
     assert acquired(other) == 2
     assert isinstance(acquired(one), LeaseHolder)
-    assert one.taken(["m"]) == {"m"}
+    assert one.lost([("m", 1)]) == {("m", 1)}
+
+
+def test_a_database_that_has_gone_back_lost_no_lease(store: Store, edges: tuple[Leases, Leases]) -> None:
+    one, other = edges
+    for _ in range(3):
+        acquired(other, "old")
+        expire(store)
+        acquired(one, "old")
+        expire(store)
+    with store._engine.begin() as db:
+        # A standby has an earlier owner of the one mission, and nothing of the other.
+        db.exec_driver_sql("UPDATE leases SET epoch = 5 WHERE mission_id = 'old'")
+    assert one.acquire("old", "http://here:1", TERM_S, 6) == 6
+    expire(store)
+    with store._engine.begin() as db:
+        db.exec_driver_sql(f"UPDATE leases SET epoch = 5, owner = '{other._owner}'")
+    assert one.lost([("old", 6), ("new", 4)]) == set()
+    for mission_id, epoch in (("old", 6), ("new", 4)):
+        # The leases are there again, and have ended.
+        assert acquired(one, mission_id) == epoch
+        expire(store)
+        assert acquired(other, mission_id) == epoch + 1
+    assert one.lost([("old", 6), ("new", 4)]) == {("old", 6), ("new", 4)}
 
 
 def test_the_epoch_grows_when_another_owner_takes_the_lease_and_never_shrinks(

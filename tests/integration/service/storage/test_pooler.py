@@ -88,7 +88,7 @@ def test_edges_share_a_pooler_of_transactions(postgres: str, role: str, tmp_path
             assert leases is not None
             for mission in range(12):
                 assert leases.acquire(f"{number}-{mission}", "http://here:1", 3600.0) == 1
-                leases.taken([f"{number}-{mission}"])
+                leases.lost([(f"{number}-{mission}", 1)])
             return [leases.renew(3600.0) for _ in range(12)]
 
         with ThreadPoolExecutor() as threads:

@@ -6,6 +6,7 @@ import sqlite3
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from alembic.config import Config
@@ -51,6 +52,8 @@ def test_a_store_that_cannot_be_used_is_refused_with_the_reason(
         "nope://x",
         "postgresql://u:p@12:hunter2@127.0.0.1/d",
         "postgresql://u:p@hunter2@h/d",
+        "postgresql://u:p/hunter2@h/d",
+        "postgresql://hunter2:p/1@h/d",
         "postgresql://u:hunter2@127.0.0.1:1/d",
     ],
 )
@@ -58,6 +61,16 @@ def test_an_address_that_is_none_is_refused_and_no_password_is_told(url: str) ->
     with pytest.raises(StoreUnusable) as refused:
         Store(url)
     assert "hunter2" not in str(refused.value)
+
+
+@pytest.mark.parametrize("scheme", ["postgresql", "postgres", "postgresql+psycopg"])
+def test_an_address_is_read_as_postgresqls_own_programs_read_it(postgres: str, scheme: str) -> None:
+    folder = parse_qs(urlsplit(postgres).query)["host"][0].replace("/", "%2F")
+    # Nobody is at the first.
+    url = f"{scheme}://postgres@%2Fnowhere:5433,{folder}:5432/postgres?target_session_attrs=read-write"
+    Store(f"{url}&application_name=edge").close()
+    with pytest.raises(StoreUnusable, match='invalid URI query parameter: "nonsense"'):
+        Store(f"{url}&nonsense=1")
 
 
 def _migrations() -> Config:

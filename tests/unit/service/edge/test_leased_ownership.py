@@ -19,13 +19,13 @@ class Database:
     def __init__(self, claimed: int, renewed: int) -> None:
         self.claimed, self.renewed = claimed, renewed
 
-    def acquire(self, mission_id: str, address: str, term_s: float) -> int:
+    def acquire(self, mission_id: str, address: str, term_s: float, known: int) -> int:
         return self.claimed
 
     def renew(self, term_s: float) -> dict[str, int]:
         return {"m": self.renewed}
 
-    def taken(self, mission_ids: Collection[str]) -> set[str]:
+    def lost(self, missions: Collection[tuple[str, int]]) -> set[tuple[str, int]]:
         return set()
 
     def unowned(self) -> list[str]:

@@ -36,7 +36,7 @@ class Disk:
 def queue(disk: Disk, monkeypatch: pytest.MonkeyPatch) -> tuple[GroupCommit, list[float], list[tuple[str, int]]]:
     """A queue, its pauses before transactions, which take no time, and the missions that it has lost."""
     pauses, lost, loop = list[float](), list[tuple[str, int]](), asyncio.get_running_loop()
-    commits = GroupCommit(disk, Metrics(), lambda mission_id, epoch: lost.append((mission_id, epoch)))
+    commits = GroupCommit(disk, Metrics(), lambda mission_id, epoch: lost.append((mission_id, epoch)), lambda: None)
     later = loop.call_later
 
     def call_later(delay: float, call: Callable[..., object], *args: object) -> asyncio.TimerHandle:
