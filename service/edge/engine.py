@@ -72,8 +72,7 @@ class Engine:
         self.compiler.compile(mission)
 
     def _recovered(self) -> None:
-        work = self._feedback.checkpoint_all(self.missions.loaded, math.inf)
-        self._recovery = asyncio.create_task(work, name="checkpoints")
+        self._recovery = asyncio.create_task(self._feedback.checkpoint_all(self.missions.loaded, math.inf))
 
     def hurry(self) -> None:
         """Prepare to close: queries to the LLM end within seconds, and pages get no more updates."""

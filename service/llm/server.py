@@ -262,10 +262,9 @@ class LlmServer:
     def _failed(self, reason: Reason, said: str = "") -> None:
         if self.status.llm != "ready" or not self._breaker.failed():
             return
-        pause_s = self._breaker.pause_s
-        detail = f"failed too often, the last time by {reason}{said}: no calls for {pause_s:g} s"
+        detail = f"failed too often, the last time by {reason}{said}: no calls for {self._breaker.pause_s:g} s"
         self.status = ServerStatus("unavailable", detail, breaker_open=True)
-        log.warning("LLM %s", self.status.detail)
+        log.warning("LLM %s", detail)
         self._on_open()
         self._task = asyncio.create_task(self._recover(), name="llm-recovery", context=Context())
 
@@ -275,14 +274,16 @@ class LlmServer:
             await asyncio.sleep(self._breaker.pause_s)
             try:
                 await self.connection.ping()
-            except NotUnderstood as error:
-                # It may have another model now.
+            except (NotUnderstood, Unreachable) as error:
+                # It may have another model now, or after its restart.
                 self.status = ServerStatus("unavailable", str(error))
                 self.start()
                 return
             except Exception as error:
                 self._breaker.failed()
-                log.warning("LLM still fails, next try in %g s: %s", self._breaker.pause_s, error)
+                failed = f"still fails, next try in {self._breaker.pause_s:g} s: {error}"
+                self.status = ServerStatus("unavailable", failed, breaker_open=True)
+                log.warning("LLM %s", failed)
             else:
                 self.status = ServerStatus("ready")
                 log.info("LLM answers again: %s", self.connection.model)

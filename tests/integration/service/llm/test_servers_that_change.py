@@ -10,13 +10,14 @@ from typing import Any
 
 import httpx
 import pytest
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 from pydantic import ValidationError
 
 from service.config.settings import Settings
 from service.llm.answers import NoDecision
 from service.llm.client import LLMClient
+from tests.integration.service.llm.test_server import Model
 from tests.integration.service.llm.test_server_pool import Named, standing_by
 from tests.integration.service.llm.test_servers_as_seen import Behaviour, Body, Plain, refused
 from tests.support.running import listening, serving
@@ -129,6 +130,36 @@ def test_a_model_renamed_while_the_server_failed_is_asked_for_again(
         name, swapping = "new", False
         until(lambda: client.get("/readyz").json()["model"] == "new")
         wait_for(client, "ready")
+        assert client.post("/decide", json=report(step=5)).json()["source"] == "llm"
+
+
+def test_a_server_whose_engine_dies_and_that_then_ends_is_probed_anew_after_its_restart(
+    edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As seen of vLLM 0.32: its worker was killed, it answered 500 to each request, and its process ended."""
+    monkeypatch.setattr("service.llm.usability.PAUSE_S", 0.05)
+    monkeypatch.setattr("service.llm.usability.LONGEST_PAUSE_S", 3600.0)
+    monkeypatch.setattr("service.llm.server.RETRY_S", 0.05)
+    server, dead = Model("structured_outputs"), False
+
+    async def complete(request: Request) -> Response:
+        return (
+            JSONResponse({"error": "EngineCore encountered an issue."}, 500) if dead else await server.complete(request)
+        )
+
+    app = FastAPI()
+    app.post("/v1/chat/completions")(complete)
+    with serving(app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        assert wait_for(client, "ready")["constraint"] == "structured_outputs"
+        dead = True
+        for step in range(3):
+            client.post("/decide", json=report(step=step))
+        # The reason is the newest one, of the probes too.
+        until(lambda: "still fails" in client.get("/readyz").json()["detail"])
+    until(lambda: "Connect" in client.get("/readyz").json()["detail"])
+    with serving(Model("grammar").app, port=int(url.rsplit(":", 1)[1])):
+        assert wait_for(client, "ready")["constraint"] == "grammar"
         assert client.post("/decide", json=report(step=5)).json()["source"] == "llm"
 
 
