@@ -72,7 +72,7 @@ class EventStream(StreamingResponse):
 
     def __init__(self, live: Broadcaster, events: AsyncGenerator[bytes], still_known: Callable[[], bool]) -> None:
         self._events = self._while_known(events, still_known)
-        super().__init__(self._events)
+        super().__init__(self._events, headers={"X-Accel-Buffering": "no"})  # Otherwise nginx with gzip sends nothing.
         self._live = live
 
     async def stream_response(self, send: Send) -> None:
