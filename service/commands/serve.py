@@ -84,7 +84,7 @@ def main(argv: list[str]) -> int:
     replicas = _bounds(args.replicas)
     if replicas is None:
         return _refused(f"--replicas {args.replicas}: give a number from 1 to 1000, or two such as 2-8")
-    if args.ray is not None and not settings.store.startswith("postgresql"):
+    if args.ray is not None and not settings.store.startswith("postgres"):
         return _refused("--ray: edges on several machines share a store only in PostgreSQL: set AICVDS_STORE")
     try:
         family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET

@@ -149,7 +149,7 @@ def test_nothing_runs_before_the_settings_are_checked(tmp_path: Path) -> None:
     [
         (["--ray", "local"], {}, "a store only in PostgreSQL"),
         (["--ray", "local", "--replicas", "4-2"], {"AICVDS_STORE": "postgresql://h/d"}, "--replicas 4-2"),
-        (["--ray", "local"], {"AICVDS_STORE": "postgresql://h/d"}, "ray is not installed. Install the extra"),
+        (["--ray", "local"], {"AICVDS_STORE": "postgres://h/d"}, "ray is not installed. Install the extra"),
         # The edges on a cluster listen on their machines' addresses, even where the ingress does not.
         (["--ray", "10.0.0.7:6379"], {"AICVDS_STORE": "postgresql://h/d"}, "anyone who reaches Ray at 10.0.0.7:6379"),
     ],
