@@ -15,16 +15,16 @@ def test_it_tells_costs_and_predicts_from_them(tmp_path: Path) -> None:
     found = figures(
         "benchmarks.capacity", *little, "--pace", "0", "--flights", "0", "--leases", "5", out=tmp_path / "c.json"
     )
-    told = found["full"]["1"]
-    spent = told["edge_s"] + told["database_s"] + told["client_s"]
-    assert told["edge_s"] > told["database_s"] > 0 and told["log_bytes"] > 0
-    assert told["predicted_a_s"] == pytest.approx(min(1 / told["edge_s"], found["cores"] / spent))
+    reported = found["full"]["1"]
+    spent = reported["edge_s"] + reported["database_s"] + reported["client_s"]
+    assert reported["edge_s"] > reported["database_s"] > 0 and reported["log_bytes"] > 0
+    assert reported["predicted_a_s"] == pytest.approx(min(1 / reported["edge_s"], found["cores"] / spent))
     # No more than what is there can have been used.
-    assert 0 < told["decisions_a_s"] * spent == pytest.approx(told["cores_used"])
+    assert 0 < reported["decisions_a_s"] * spent == pytest.approx(reported["cores_used"])
     assert found["commits_a_s"]["1"] > 0 and found["renewal"]["leases"] == 5
 
 
 def test_the_cost_of_a_decision_in_a_mode_that_asks_no_llm(tmp_path: Path) -> None:
     found = modes(tmp_path, Capacity(flights=1), (("value", "on"),))
-    (told,) = found.values()
-    assert list(found) == ["value, planner on"] and 0 < told["edge_s"] < 1 and told["decisions_a_s"] > 0
+    (reported,) = found.values()
+    assert list(found) == ["value, planner on"] and 0 < reported["edge_s"] < 1 and reported["decisions_a_s"] > 0

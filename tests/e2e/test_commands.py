@@ -127,7 +127,7 @@ def complete(text: str) -> bool:
     return not text.endswith("\\\n")
 
 
-def told() -> list[tuple[str, str]]:
+def reported() -> list[tuple[str, str]]:
     """Every command, with its page."""
     return [(page.relative_to(ROOT).as_posix(), command) for page in PAGES for command in commands(page)]
 
@@ -136,7 +136,7 @@ def begins(command: str, how: dict[str, str]) -> bool:
     return any(command.removeprefix(BIN).startswith(start) for start in how)
 
 
-TOLD = told()
+TOLD = reported()
 
 
 @pytest.mark.parametrize(("page", "command"), TOLD)

@@ -100,14 +100,14 @@ def flown_with_an_outage(
 @pytest.mark.long
 @pytest.mark.timeout(600)
 def test_every_waypoint_is_decided_though_the_edge_is_gone_for_twenty_seconds(tmp_path: Path) -> None:
-    decisions, peers, told = flown_with_an_outage(tmp_path, speedup=2.0)
+    decisions, peers, reported = flown_with_an_outage(tmp_path, speedup=2.0)
     assert [(d.step, d.uav_id) for d in decisions] == [(step, uav) for step in range(STEPS) for uav in range(UAVS)]
     # The outage begins within step 14 and lasts four steps, and the edge starts again in some more.
-    assert all(d.source == "onboard" for d in decisions if 15 <= d.step < 18), told
+    assert all(d.source == "onboard" for d in decisions if 15 <= d.step < 18), reported
     assert {d.source for d in decisions if d.step >= 25} >= {"policy"}, "the edge decides again"
     assert len(read_logged_mission(tmp_path / "out").decisions) == STEPS * UAVS
     check_wire(peers, decisions)
-    check_report(tmp_path / "out", decisions, told)
+    check_report(tmp_path / "out", decisions, reported)
 
 
 @pytest.mark.faults
@@ -127,10 +127,12 @@ def test_airframes_with_limits_fly_what_is_decided_and_lose_no_more_than_the_sim
 
 def lost_with_limits(tmp_path: Path, seed: int) -> int:
     """The packets that the flight's sensors lost; it checks all the rest of the flight."""
-    decisions, peers, told = flown_with_an_outage(tmp_path, 1.0, ARDUPILOT, seed, TOP_SPEED, top=11.0, accelerates=2.5)
+    decisions, peers, reported = flown_with_an_outage(
+        tmp_path, 1.0, ARDUPILOT, seed, TOP_SPEED, top=11.0, accelerates=2.5
+    )
     assert [(d.step, d.uav_id) for d in decisions] == [(step, uav) for step in range(STEPS) for uav in range(UAVS)]
     real = Summary.model_validate_json((tmp_path / "out" / "summary.json").read_bytes()).real_uavs
-    assert real is not None and real.late == 0 and not real.undecided, told
+    assert real is not None and real.late == 0 and not real.undecided, reported
     assert not real.ended and not real.warnings
     world = site_from_folder(tmp_path / "pipeline_laps")
     for uav, peer in enumerate(peers):
@@ -139,7 +141,7 @@ def lost_with_limits(tmp_path: Path, seed: int) -> int:
     decided_m, flown_m = metres_after(3, tmp_path / "out", decisions)
     assert flown_m == pytest.approx(decided_m, rel=0.05)
     for one in real.uavs:
-        assert f"{one.decided_m:,.0f}" in told and f"{one.flown_m:,.0f}" in told
+        assert f"{one.decided_m:,.0f}" in reported and f"{one.flown_m:,.0f}" in reported
     assert real.simulated_lost is not None
     return real.simulated_lost
 
@@ -179,7 +181,7 @@ def metres_after(first: int, out: Path, decisions: list[Decision]) -> tuple[floa
     return decided_m, sum(own[STEPS - 1] - own[first] for own in progress.values())
 
 
-def check_report(out: Path, decisions: list[Decision], told: str) -> None:
+def check_report(out: Path, decisions: list[Decision], reported: str) -> None:
     """Summary, page and terminal agree with the log."""
     summary = Summary.model_validate_json((out / "summary.json").read_bytes())
     assert (summary.steps_flown, summary.decisions, summary.uavs, summary.mode) == (STEPS, STEPS * UAVS, UAVS, "policy")
@@ -199,7 +201,7 @@ def check_report(out: Path, decisions: list[Decision], told: str) -> None:
         f"{name}.svg" for name in ("losses", "visits", "latency-map", "latency-steps", "deciders")
     }
     assert f"The UAVs heard that sensors lost {lost:,} packet" in page
-    printed = " ".join(told.split())
+    printed = " ".join(reported.split())
     assert f"Late: {real.late} decisions after their waypoint's step" in printed
     assert f"{STEPS * UAVS} decisions: " in printed and "Round trip: median" in printed
     assert f"Wrote {out / 'report.html'}" in printed

@@ -137,10 +137,10 @@ def test_uplinks_reach_the_mission(
         there.publish(topic("kp-2"), message(device=2, queue=60, at=ago(0)))
         until(lambda: numbers(metrics)['aicvds_mqtt_readings_total{result="merged"}'] == 3 or merged(wide) == 3)
         until(lambda: numbers(metrics).get('aicvds_mqtt_uplinks_total{result="accepted"}') == 4)
-        told = numbers(metrics)
+        reported = numbers(metrics)
         for result in ("unknown_device", "no_queue", "unreadable"):
-            assert told[f'aicvds_mqtt_uplinks_total{{result="{result}"}}'] == 1
-        assert told["aicvds_mqtt_connected"] == 1
+            assert reported[f'aicvds_mqtt_uplinks_total{{result="{result}"}}'] == 1
+        assert reported["aicvds_mqtt_connected"] == 1
         process.send_signal(end)
         assert process.wait(PATIENCE_S) == 0
 

@@ -185,8 +185,8 @@ def asked_by_the_dashboard() -> list[str]:
 
 def fast(text: str) -> str:
     """The text with durations of minutes as seconds."""
-    told = re.sub(r"(?<=\[)\w+(?=\])|(?<=offset )\w+", lambda match: FAST[match[0]], text)
-    return re.sub(r"for: .*", "for: 1s", told)
+    reported = re.sub(r"(?<=\[)\w+(?=\])|(?<=offset )\w+", lambda match: FAST[match[0]], text)
+    return re.sub(r"for: .*", "for: 1s", reported)
 
 
 def filled_in(expression: str) -> str:

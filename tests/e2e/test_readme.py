@@ -48,9 +48,9 @@ def test_a_note_is_understood_and_confirmed_as_pasted() -> None:
     with serving_edge() as (url, _):
         json.loads(pasted(put, url))
         until(lambda: GuidanceStatus.model_validate_json(pasted(get, url)).status != "compiling")
-        told = GuidanceStatus.model_validate_json(pasted(get, url))
-        assert told.status == "proposed" and told.guidance is not None, told.failure
-        assert [wish.model_dump() for wish in told.guidance.sensors] == [
+        reported = GuidanceStatus.model_validate_json(pasted(get, url))
+        assert reported.status == "proposed" and reported.guidance is not None, reported.failure
+        assert [wish.model_dump() for wish in reported.guidance.sensors] == [
             {"sensor_id": 4, "weight": 1.0, "visit_every": 3}
         ]
         assert GuidanceStatus.model_validate_json(pasted(confirm, url)).status == "confirmed"

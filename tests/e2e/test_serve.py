@@ -107,8 +107,8 @@ def test_a_busy_port_is_one_clear_line() -> None:
 
 @pytest.mark.usefixtures("unmarked")
 def test_a_misspelt_setting_is_told() -> None:
-    told = run_here("serve", AICVDS_TOPK="3", AICVDS_TOP_K="0")
-    assert "AICVDS_TOP_K" in told.stderr
+    reported = run_here("serve", AICVDS_TOPK="3", AICVDS_TOP_K="0")
+    assert "AICVDS_TOP_K" in reported.stderr
     with started("serve", "--port", "0", AICVDS_PROCESSES="2", AICVDS_TOPK="3") as process:
         replaced = "AICVDS_PROCESSES is no setting and changes nothing: several edges share one PostgreSQL"
         misspelt = "AICVDS_TOPK is no setting and changes nothing; did you mean AICVDS_TOP_K?"
@@ -167,11 +167,11 @@ def test_the_banner_says_what_runs_and_what_to_type_next(tmp_path: Path) -> None
     with started("serve", "--port", "0", "--mode", "value", "--store", str(store), AICVDS_MODE="policy") as process:
         url, lines = output_until(process, r"listening on (http://[\d.:]+)[^\0]*ready\n((?:  .*\n){5})").groups()
         assert httpx.put(f"{url}/missions/m", json={}, timeout=PATIENCE_S).json()["mode"] == "value"
-    told = dict(line.split(maxsplit=1) for line in lines.strip().splitlines())
-    assert told["page"] == f"{url}/"
-    assert told["decides"] == "mode value, without an LLM"
-    assert told["store"] == f"{store}, 0 missions"
-    assert told["next"] == f"aicvds simulate --edge {url} --out runs/mission"
+    reported = dict(line.split(maxsplit=1) for line in lines.strip().splitlines())
+    assert reported["page"] == f"{url}/"
+    assert reported["decides"] == "mode value, without an LLM"
+    assert reported["store"] == f"{store}, 0 missions"
+    assert reported["next"] == f"aicvds simulate --edge {url} --out runs/mission"
     assert store.exists()
 
 

@@ -41,8 +41,8 @@ class Patient(EdgePilot):
         return super().decide(uav, observation, taken)
 
     def _learned(self) -> bool:
-        told = self._edge.mission(self._name)
-        return told.learner_updates == told.feedback
+        reported = self._edge.mission(self._name)
+        return reported.learner_updates == reported.feedback
 
     def learn(self, uav: int, choice: PilotChoice, cost: float, failed: bool) -> None:
         assert choice.exchange is not None, self.last_error
@@ -168,17 +168,17 @@ def test_pruned_reports_are_told_in_full_to_an_edge_that_forgot(edge: Edge) -> N
 def test_simulate_tells_the_uplink_and_its_bytes(edge: Edge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Its figures for print are not looked at.
     monkeypatch.setattr("simulator.reporting.figure_style.PaperFigure.write", lambda *_: [])
-    told, flight = {}, ("--edge", str(edge().base_url), "--steps", "6", "--deadline-ms", "60000")
+    reported, flight = {}, ("--edge", str(edge().base_url), "--steps", "6", "--deadline-ms", "60000")
     for uplink in ("full", "delta", "pruned"):
         out = tmp_path / uplink
         done = run_here("simulate", *flight, "--uplink", uplink, "--out", str(out))
         assert done.returncode == 0, done.stderr
         assert f"Uplink {uplink}: " in done.stdout
-        told[uplink] = json.loads((out / "summary.json").read_text())
-        assert told[uplink]["uplink"] == uplink and f"uplink {uplink}" in (out / "report.html").read_text()
+        reported[uplink] = json.loads((out / "summary.json").read_text())
+        assert reported[uplink]["uplink"] == uplink and f"uplink {uplink}" in (out / "report.html").read_text()
         # In full, whatever was sent: it can be asked again.
         lines = (out / "requests.jsonl").read_text().splitlines()[1:]
         assert {len(json.loads(line)["sensors"]["x"]) for line in lines} == {10}
-    sizes = {uplink: summary["uplink_bytes_mean"] for uplink, summary in told.items()}
+    sizes = {uplink: summary["uplink_bytes_mean"] for uplink, summary in reported.items()}
     assert max(sizes["delta"], sizes["pruned"]) < 0.7 * sizes["full"]
-    assert told["pruned"]["attention_bytes_mean"] > told["full"]["attention_bytes_mean"] == 0
+    assert reported["pruned"]["attention_bytes_mean"] > reported["full"]["attention_bytes_mean"] == 0

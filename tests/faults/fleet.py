@@ -32,7 +32,7 @@ class Asked:
         """The share that came no later than so many milliseconds past its deadline."""
         return sum(late <= slack_ms for late in self.late_ms) / len(self.late_ms)
 
-    def told(self) -> str:
+    def reported(self) -> str:
         """The reasons, the most frequent first."""
         return ", ".join(f"{reason} {count}" for reason, count in self.reasons.most_common())
 

@@ -48,9 +48,9 @@ class Uav(threading.Thread):
             with httpx.Client() as client:
                 step = 0
                 while not self.over:
-                    owed = self._decide(client, step)
-                    if owed is not None:
-                        self._tell(client, owed)
+                    pending = self._decide(client, step)
+                    if pending is not None:
+                        self._tell(client, pending)
                     step += 1
         except (AssertionError, httpx.HTTPError) as error:
             self.wrong = repr(error)

@@ -63,7 +63,7 @@ def fuzz(url: str, headers: dict[str, str], cases: int) -> Counter[tuple[str, in
     return statuses
 
 
-def told(statuses: Counter[tuple[str, int]]) -> str:
+def reported(statuses: Counter[tuple[str, int]]) -> str:
     by_status: Counter[int] = Counter()
     for (_, status), count in statuses.items():
         by_status[status] += count
@@ -95,7 +95,7 @@ def test_ten_thousand_cases(tmp_path: Path, tables: Tables) -> None:
             holds()
         rows.append(("no key, and a wrong one", refused))
     for who, statuses in rows:
-        tables.add("schemathesis", who=who, cases=sum(statuses.values()), statuses=told(statuses))
+        tables.add("schemathesis", who=who, cases=sum(statuses.values()), statuses=reported(statuses))
     assert sum(sum(statuses.values()) for _, statuses in rows) >= CASES
     assert [s for _, statuses in rows for (_, s) in statuses if s >= 500] == []
     assert {status for (path, status) in refused if path not in OPEN} == {401}

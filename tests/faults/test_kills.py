@@ -41,7 +41,7 @@ class Uav(threading.Thread):
         self.uav, self._report = uav, report
         self.url = ""
         self.step = 0
-        self.owed: dict[str, Any] | None = None
+        self.pending: dict[str, Any] | None = None
         self.acknowledged: list[dict[str, Any]] = []
         self.results: dict[str, int] = {"applied": 0, "duplicate": 0}
         self.over = False
@@ -61,12 +61,12 @@ class Uav(threading.Thread):
                 return
 
     def turn(self, client: httpx.Client) -> None:
-        if self.owed is not None:
-            told = client.post("/feedback", json=self.owed)
-            assert told.status_code == 200, f"an outcome was refused: {told.text}"
-            self.results[told.json()["result"]] += 1
-            self.acknowledged.append(self.owed)
-            self.owed = None
+        if self.pending is not None:
+            reported = client.post("/feedback", json=self.pending)
+            assert reported.status_code == 200, f"an outcome was refused: {reported.text}"
+            self.results[reported.json()["result"]] += 1
+            self.acknowledged.append(self.pending)
+            self.pending = None
         body = self._report(step=self.step, uav_id=self.uav, mission_id=MISSION)
         # The links differ from the formula, by the sensor and by the step.
         gains = body["sensors"]["channel_gain"]
@@ -76,7 +76,7 @@ class Uav(threading.Thread):
         self.step += 1
         self.unstored += not answer.json()["stored"]
         decision, cost, failed = answer.json()["decision_id"], self.step % 7 / 10, self.step % 5 == 0
-        self.owed = {"mission_id": MISSION, "decision_id": decision, "cost": cost, "failed": failed}
+        self.pending = {"mission_id": MISSION, "decision_id": decision, "cost": cost, "failed": failed}
 
 
 def test_kills_under_load(tmp_path: Path, report: Report, tables: Tables) -> None:
@@ -187,10 +187,10 @@ def test_a_start_with_a_long_journal(
             # As after a kill: the journal is all there is.
             patch.setattr(Journal, "due", lambda *_: None)
             with serving(create_app(Settings(mode="value"), Store(str(path)))) as url, httpx.Client() as client:
-                owed = None
+                pending = None
                 for step in range(80):
-                    answer = client.post(f"{url}/decide", json=report(step=step, outcome=owed)).json()
-                    owed = {"decision_id": answer["decision_id"], "cost": 0.1}
+                    answer = client.post(f"{url}/decide", json=report(step=step, outcome=pending)).json()
+                    pending = {"decision_id": answer["decision_id"], "cost": 0.1}
     missions = lengthen(tmp_path / "long.db", JOURNAL_ROWS, 239)
     imports = min(imports_s() for _ in range(3))
     short = [start_s(tmp_path / "short.db") for _ in range(3)]

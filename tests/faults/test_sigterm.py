@@ -34,13 +34,13 @@ class Uav(threading.Thread):
     def __init__(self, number: int, url: str, report: Report) -> None:
         super().__init__(daemon=True)
         self._mission, self._url, self._report = f"m{number}", url, report
-        self.told: list[str] = []
+        self.reported: list[str] = []
         self.acknowledged = self.cut = 0
-        self.owed: dict[str, Any] | None = None
+        self.pending: dict[str, Any] | None = None
 
     def run(self) -> None:
         for step in range(10_000):
-            body = self._report(step=step, mission_id=self._mission, outcome=self.owed)
+            body = self._report(step=step, mission_id=self._mission, outcome=self.pending)
             try:
                 # A connection each: a kept one may be closed just as a request goes out on it.
                 answer = httpx.post(f"{self._url}/decide", json=body, timeout=30)
@@ -51,9 +51,9 @@ class Uav(threading.Thread):
                 return
             assert answer.status_code == 200, answer.text
             assert answer.json()["stored"] is True
-            self.acknowledged += self.owed is not None
-            self.told.append(answer.json()["decision_id"])
-            self.owed = {"decision_id": self.told[-1], "cost": 0.2}
+            self.acknowledged += self.pending is not None
+            self.reported.append(answer.json()["decision_id"])
+            self.pending = {"decision_id": self.reported[-1], "cost": 0.2}
 
 
 def test_sigterm_under_load(tmp_path: Path, report: Report, tables: Tables) -> None:
@@ -89,7 +89,7 @@ def test_sigterm_under_load(tmp_path: Path, report: Report, tables: Tables) -> N
                     acknowledged += uav.acknowledged
                     cut += uav.cut
                     lost += uav.acknowledged - status["feedback"]
-                    lost += len(uav.told) - status["decisions"]
+                    lost += len(uav.reported) - status["decisions"]
     tables.add(
         "SIGTERM under load",
         times=TIMES,

@@ -78,7 +78,7 @@ def test_a_server_that_turns_bad(name: str, report: Report, tables: Tables) -> N
         # Not while a UAV waits.
         bomb()
         warm = ask(url, report, 300, DEADLINE_MS)
-        assert warm.reasons["none"] > 250, warm.told()
+        assert warm.reasons["none"] > 250, warm.reported()
         before_mb = resident_mb(process.pid)
         switch.fault = UPSTREAMS[name]
         asked = ask(url, report, DECISIONS, DEADLINE_MS, first_step=100)
@@ -93,7 +93,7 @@ def test_a_server_that_turns_bad(name: str, report: Report, tables: Tables) -> N
             decisions=len(asked.late_ms),
             in_time=f"{asked.within(SLACK_MS):.1%}",
             latest_ms_past_the_deadline=f"{asked.worst_ms:.0f}",
-            reasons=asked.told(),
+            reasons=asked.reported(),
             breaker_opened=times_opened,
             memory_MB=f"{grown_mb:+.1f}",
             by_the_LLM_when_well_again=f"{again.reasons['none']} of 90",
@@ -102,7 +102,7 @@ def test_a_server_that_turns_bad(name: str, report: Report, tables: Tables) -> N
         assert asked.within(SLACK_MS) == 1.0, f"{asked.worst_ms:.0f} ms late"
         assert asked.reasons["none"] == 0
         assert (times_opened == 0) == (name in ANSWERED)
-        assert again.reasons["none"] > 80, again.told()
+        assert again.reasons["none"] > 80, again.reported()
         assert grown_mb < 15
 
 
@@ -175,7 +175,7 @@ def test_a_server_that_cannot_be_reached(name: str, report: Report, tables: Tabl
             decisions=len(asked.late_ms),
             in_time=f"{asked.within(SLACK_MS):.1%}",
             latest_ms_past_the_deadline=f"{asked.worst_ms:.0f}",
-            reasons=asked.told(),
+            reasons=asked.reported(),
             breaker_opened="never ready",
             memory_MB=f"{grown_mb:+.1f}",
             by_the_LLM_when_well_again="",

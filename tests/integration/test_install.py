@@ -79,10 +79,10 @@ def test_a_link_is_replaced_and_not_what_it_leads_to_and_pip_installs_for_no_use
     monkeypatch.setenv("PIP_USER", "1")
     monkeypatch.setattr(sys, "argv", ["install.py", "demo"])
     # Instead of an installation: what pip would be told.
-    told: list[str] = []
+    reported: list[str] = []
 
     def nothing() -> install.Installer:
-        told.append(os.environ["PIP_USER"])
+        reported.append(os.environ["PIP_USER"])
         return install.Installer("none", [sys.executable, "-c", ""], "", {})
 
     monkeypatch.setattr(install, "HERE", tmp_path / "here")
@@ -90,7 +90,7 @@ def test_a_link_is_replaced_and_not_what_it_leads_to_and_pip_installs_for_no_use
     monkeypatch.setattr(install, "_prepare", lambda: None)
     monkeypatch.setattr(venv, "create", lambda folder, **options: folder.mkdir())
     assert install.main() == 0
-    assert told == ["0"] and (other / "bin" / "pip").exists()
+    assert reported == ["0"] and (other / "bin" / "pip").exists()
     assert not (tmp_path / "here" / ".venv").is_symlink()
 
 

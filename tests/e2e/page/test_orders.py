@@ -100,11 +100,11 @@ def test_a_confirmed_note_shows_the_same_deadlines_everywhere(edge: str, visit: 
     # So that no number agrees by being 0.
     assert met > 0 and missed > 0
     operator = json.loads((out / "summary.json").read_bytes())["operator"]
-    told = httpx.get(f"{edge}/missions/patrol").json()["deadlines"]
+    reported = httpx.get(f"{edge}/missions/patrol").json()["deadlines"]
     (flown,) = operator["in_force"]
     assert (flown["note"], flown["in_words"], flown["since_step"], flown["until_step"]) == (NOTE, FIRST, 0, None)
-    assert operator["deadlines"] == told
-    assert told == [{"sensor_id": 3, "visit_every": EVERY, "since": 0, "until": None, "met": met, "missed": missed}]
+    assert operator["deadlines"] == reported
+    assert reported == [{"sensor_id": 3, "visit_every": EVERY, "since": 0, "until": None, "met": met, "missed": missed}]
     report = (out / "report.html").read_text(encoding="utf-8")
     assert f"<td>visit deadlines met / missed</td><td>{met} / {missed}</td>" in report
     assert f"<td>sensor 3, every 3 steps</td><td>0</td><td>29</td><td>{met}</td><td>{missed}</td>" in report

@@ -68,11 +68,11 @@ def test_a_mission_appears_while_it_flies(another_edge: str, visit: Open, tmp_pa
 
 
 def test_where_no_round_trip_is_told_the_edges_time_is_shown(visit: Open, edge: str, report: Report) -> None:
-    told = None
+    reported = None
     for step in range(3):
-        body = report(mission_id="silent", step=step, position=[500.0, 450.0 + 50 * step], outcome=told)
+        body = report(mission_id="silent", step=step, position=[500.0, 450.0 + 50 * step], outcome=reported)
         answer = httpx.post(f"{edge}/decide", json=body, timeout=PATIENCE_S).json()
-        told = {"decision_id": answer["decision_id"], "cost": 0.5}
+        reported = {"decision_id": answer["decision_id"], "cost": 0.5}
     page = visit(f"{edge}/?mission=silent")
     expect(page.locator("#legend")).to_contain_text("the edge's own time: these UAVs do not report")
     expect(page.locator("#feed li").first).to_contain_text("ms at the edge")

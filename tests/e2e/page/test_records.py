@@ -81,9 +81,9 @@ def test_nothing_contradicts_the_records(visit: Open, edge: str, tmp_path: Path,
         if source != "onboard":
             assert f"{count} {WORDS[source]}" in found["Decisions"][1]
     assert found["Failed"][0] == str(failed)
-    told = re.search(r"of (\d+) reported transmissions; cost ([\d.,]+)", found["Failed"][1])
-    assert told is not None and int(told[1]) == len(from_edge)
-    assert float(told[2].replace(",", "")) == pytest.approx(sum(d["cost"] for d in from_edge), abs=0.051)
+    reported = re.search(r"of (\d+) reported transmissions; cost ([\d.,]+)", found["Failed"][1])
+    assert reported is not None and int(reported[1]) == len(from_edge)
+    assert float(reported[2].replace(",", "")) == pytest.approx(sum(d["cost"] for d in from_edge), abs=0.051)
     assert ("Tokens saved" in found) == (mode in ("guided", "llm"))
     for card in page.locator("#feed .by").all_inner_texts():
         assert any(card.startswith(WORDS[source]) for source in sources if source != "onboard")

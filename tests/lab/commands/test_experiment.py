@@ -133,11 +133,11 @@ def test_an_edge_that_dies_is_told_with_its_log(tmp_path: Path) -> None:
     try:
         until_flights(tmp_path, process, 1)
         os.kill(edge_of(process), signal.SIGKILL)
-        _, told = process.communicate(timeout=PATIENCE_S)
+        _, reported = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
     assert process.returncode == 1
-    error = told.decode()
+    error = reported.decode()
     assert "the edge ended with code -9" in error and "edge-off.log" in error and "Traceback" not in error
 
 

@@ -62,9 +62,9 @@ def test_killed_and_resumed_it_ends_with_the_weights_of_a_training_left_alone(tm
 
 
 def test_help_teaches() -> None:
-    told = run_lab_here("train", "--help").stdout
+    reported = run_lab_here("train", "--help").stdout
     for word in ("madqn", "mappo", "--resume", "--episodes", "tensorboard"):
-        assert word in told
+        assert word in reported
 
 
 @pytest.mark.parametrize(

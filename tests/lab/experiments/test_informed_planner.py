@@ -50,7 +50,7 @@ def test_the_links_of_its_problem_move_what_the_world_moves(name: str) -> None:
     planner.decide(0, observations["uav_0"], NONE)
     draft = planner.draft(0, NONE)
     assert draft is not None and draft.problem.links is not None and draft.problem.chances is None
-    told = draft.problem.links[draft.uavs.index(0)][0]
+    reported = draft.problem.links[draft.uavs.index(0)][0]
     moved = []
     for sensor in draft.kept.tolist():
         world.reset(seed=4)
@@ -58,7 +58,7 @@ def test_the_links_of_its_problem_move_what_the_world_moves(name: str) -> None:
         idle = (sensor, 0)
         *_, infos = world.step({"uav_0": (sensor, 9), "uav_1": idle, "uav_2": idle})
         moved.append(infos["uav_0"]["collected"])
-    assert moved == [min(60, packets) for packets in told[9, :-1].tolist()]
+    assert moved == [min(60, packets) for packets in reported[9, :-1].tolist()]
     assert sum(moved) > 0
 
 
@@ -68,5 +68,5 @@ def test_in_a_world_as_modelled_it_is_mpc() -> None:
     def decisions(flight: Flight) -> list[tuple[int, int]]:
         return [(d.sensor_id, d.velocity) for d in flight.decisions]
 
-    told, own = fly(site, InformedPilot(site, 1), 1), fly(site, LocalPilot("mpc", site.scenario, 1), 1)
-    assert decisions(told) == decisions(own)
+    reported, own = fly(site, InformedPilot(site, 1), 1), fly(site, LocalPilot("mpc", site.scenario, 1), 1)
+    assert decisions(reported) == decisions(own)

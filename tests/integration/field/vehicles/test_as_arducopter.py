@@ -139,10 +139,10 @@ async def test_an_arducopter_waits_in_its_mission_and_goes_on_where_it_was(
             await uav.command(0)
             await uav.command(9)
             assert not peer.airframe.paused and not uav.waits and peer.airframe.flown_m >= 900.0
-            told = without_repeats(
+            reported = without_repeats(
                 (m.command, m.param2 if m.command == SPEED else m.param1) for _, m in peer.commands()
             )
-            assert told == [(PAUSE, 0.0), (PAUSE, 1.0), (SPEED, pytest.approx(9.0, abs=0.2))]
+            assert reported == [(PAUSE, 0.0), (PAUSE, 1.0), (SPEED, pytest.approx(9.0, abs=0.2))]
             # It is taking off again, where ArduCopter refuses a pause.
             peer.airframe.climbs_m = 50.0
             with pytest.raises(VehicleError, match="did not hold: MAV_RESULT 4"):

@@ -35,14 +35,19 @@ def test_the_weights_are_those_that_decide(tmp_path: Path, report: Report, featu
         client.put("/missions/test", json={"features": features, "top_k": 3}).raise_for_status()
         learned(client, report)
         answer = client.get(PATH)
-        told = MissionAttention.model_validate_json(answer.content)
-        assert (told.mission_id, told.features, told.belief, told.top_k) == ("test", features, "fleet", 3)
-        assert told.updates == 1
+        reported = MissionAttention.model_validate_json(answer.content)
+        assert (reported.mission_id, reported.features, reported.belief, reported.top_k) == (
+            "test",
+            features,
+            "fleet",
+            3,
+        )
+        assert reported.updates == 1
         kept = engine.missions.loaded[0].learner.weights.attention
-        assert [w.name for w in told.weights] == ["query", "key", "value", "score", "bias"]
-        for w in told.weights:
+        assert [w.name for w in reported.weights] == ["query", "key", "value", "score", "bias"]
+        for w in reported.weights:
             assert np.array_equal(np.array(w.values, np.float32).reshape(w.shape), kept[w.name])
-        assert told.weights[0].shape == [32, numbers]
+        assert reported.weights[0].shape == [32, numbers]
 
 
 def test_what_is_held_is_not_sent_again(edge: Edge, report: Report) -> None:

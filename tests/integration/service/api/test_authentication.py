@@ -283,8 +283,8 @@ def test_bad_use_is_one_clear_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
 ) -> None:
     assert main([*arguments, "--file", str(tmp_path / "keys.json")]) == 2
-    told = capsys.readouterr().err
-    assert said in told and told.count("\n") == 1
+    reported = capsys.readouterr().err
+    assert said in reported and reported.count("\n") == 1
     assert not (tmp_path / "keys.json").exists()
 
 

@@ -85,10 +85,10 @@ def test_the_schema_refuses_what_is_no_example() -> None:
 DECISION_ID = ANSWERS["post /decide"]["decision_id"]
 
 
-def told(value: Json, decision_id: str) -> Json:
+def reported(value: Json, decision_id: str) -> Json:
     """An example with the id of a decision that there is."""
     if isinstance(value, dict):
-        return {key: told(inner, decision_id) for key, inner in value.items()}
+        return {key: reported(inner, decision_id) for key, inner in value.items()}
     return decision_id if value == DECISION_ID else value
 
 
@@ -100,7 +100,9 @@ def test_a_real_edge_takes_every_example_and_answers_as_the_examples_do(edge: Ed
         method, path = route.split()
         for name, example in REQUESTS[route].items():
             mission_id = name if method == "put" else "preset"
-            answer = http.request(method, path.format(mission_id=mission_id), json=told(example["value"], decision_id))
+            answer = http.request(
+                method, path.format(mission_id=mission_id), json=reported(example["value"], decision_id)
+            )
             assert answer.status_code == 200, f"{method} {path}, example {name}: {answer.text}"
             # A status has names where the mission was given some.
             named = {"names"} & example["value"].keys()

@@ -46,10 +46,10 @@ _NAMES = {f"{number:x}": 0 for number in range(15_000)}
 def test_faults_without_number_are_a_few(edge: Edge, method: str, path: str, body: Body, field: str) -> None:
     client = edge(max_body_bytes=10_000_000)
     client.put("/missions/m", json={})
-    told = fields(client.request(method, path, json=body))
+    reported = fields(client.request(method, path, json=body))
     # Of a scenario there is one more for its being no name, of a point one for each number, of a route its length.
-    assert field in told
-    assert len(told) <= 4
+    assert field in reported
+    assert len(reported) <= 4
 
 
 LISTS = "has more than 120000 lists and objects"

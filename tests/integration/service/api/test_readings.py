@@ -33,9 +33,9 @@ def test_readings_are_answered_each_and_counted(edge: Edge, report: Report) -> N
     answers = [client.post(PATH, json=one(message_id=name)).json() for name in ("m1", "m1", "m2")]
     assert [answer["results"] for answer in answers] == [["merged"], ["duplicate"], ["outdated"]]
     assert client.get("/missions/test").json()["readings"] == 1
-    told = client.get("/metrics").text
+    reported = client.get("/metrics").text
     for result in ("early", "merged", "duplicate", "outdated"):
-        assert f'aicvds_readings_total{{result="{result}"}} 1.0' in told
+        assert f'aicvds_readings_total{{result="{result}"}} 1.0' in reported
 
 
 def test_a_decision_reckons_with_what_a_sensor_said_of_itself(edge: Edge, report: Report) -> None:
@@ -120,11 +120,11 @@ def test_the_client_reports_readings(edge: Edge, report: Report) -> None:
 def test_acknowledged_readings_survive_a_power_failure(tmp_path: Path, report: Report) -> None:
     path = tmp_path / "m.db"
     with running(path) as (client, engine):
-        owed = fly(client, report, range(3))
+        pending = fly(client, report, range(3))
         given = {"readings": [{"sensor_id": 7, "queue": 9, "age_s": 3600.5, "message_id": "x"}]}
         assert client.post(PATH, json=given).json()["results"] == ["merged"]
         assert client.post(PATH, json=one(sensor_id=8, step=2, message_id="y")).json()["results"] == ["merged"]
-        fly(client, report, range(3, 4), owed)
+        fly(client, report, range(3, 4), pending)
         mission = wait_for_updates(engine, engine.missions.loaded[0], 9)
         on_disk, before = copy_of(path, tmp_path / "copy.db"), state(mission)
     with running(on_disk) as (client, engine):

@@ -298,8 +298,8 @@ def test_a_mission_says_how_it_shows_the_sensors(edge: Edge, report: Report) -> 
 def test_a_mission_may_look_ahead(edge: Edge, report: Report) -> None:
     client = edge()
     assert client.put("/missions/ahead", json={"features": "reach"}).json()["features"] == "reach"
-    told, off = report(mission_id="ahead", step=0, progress_m=0.0), report(mission_id="ahead", step=1)
-    for body in (told, off):
+    reported, off = report(mission_id="ahead", step=0, progress_m=0.0), report(mission_id="ahead", step=1)
+    for body in (reported, off):
         answer = client.post("/decide", json=body)
         assert (answer.status_code, answer.json()["source"]) == (200, "value"), answer.text
     outcome = {"decision_id": answer.json()["decision_id"], "cost": 1.0}

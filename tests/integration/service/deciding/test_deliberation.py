@@ -187,8 +187,8 @@ def test_a_bad_llm_cannot_talk_the_fleet_out_of_its_plan(answer: str) -> None:
         judgement = made.evaluate()
         labels = made.candidates.labels
         worst = max(labels, key=lambda name: judgement.lost[labels[name]])
-        told = worst if answer == "worst" else str(random.choice(list(labels)))
-        word = np.array(list(made.candidates.by_action({name: float(name == told) for name in labels}).values()))
+        reported = worst if answer == "worst" else str(random.choice(list(labels)))
+        word = np.array(list(made.candidates.by_action({name: float(name == reported) for name in labels}).values()))
         verdict = made.conclude(trust, judgement, word, calibrated=False)
         assert verdict is not None and verdict.action == plan
         assert set(verdict.report.trust) == {"llm", "planner", "value", "policy"}
@@ -229,10 +229,10 @@ def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
     judgement = made.evaluate()
     worst = max(made.candidates.labels, key=lambda name: judgement.lost[made.candidates.labels[name]])
     assert judgement.lost.max() - judgement.lost.min() > 8
-    told = np.array(
+    reported = np.array(
         list(made.candidates.by_action({name: float(name == worst) for name in made.candidates.labels}).values())
     )
-    verdict = made.conclude(mission.trust["stub"], judgement, told, calibrated=False)
+    verdict = made.conclude(mission.trust["stub"], judgement, reported, calibrated=False)
     assert verdict is not None
     assert verdict.action != made.candidates.actions[made.candidates.labels[worst]]
 

@@ -128,12 +128,12 @@ def test_in_a_batch_the_critic_may_take_what_the_others_do_not_need(
 
     async def lingering(self: LlmQueries, *asked: Any) -> LlmAdvice:
         """The first UAV's half of the minute is over, and the critic is done a moment after that."""
-        told = await ask(self, *asked)
+        reported = await ask(self, *asked)
         if not clock.ahead_s:
             await soon(lambda: stuck.gate.callers)
             clock.ahead_s = 40.0
             asyncio.get_running_loop().call_later(0.05, stuck.gate.open)
-        return told
+        return reported
 
     monkeypatch.setattr(LlmQueries, "ask", lingering)
     monkeypatch.setattr("service.deciding.stopwatch.time", clock)

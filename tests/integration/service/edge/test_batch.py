@@ -65,8 +65,8 @@ class Chorus(StubLlm):
 
     def questions(self) -> list[str]:
         """What was asked about decisions: neither probes nor questions that say nothing."""
-        told = [body["messages"][-1]["content"] for body in self.bodies]
-        return [text for text in told if text != "Say hello." and not set("?/") & set(text)]
+        reported = [body["messages"][-1]["content"] for body in self.bodies]
+        return [text for text in reported if text != "Say hello." and not set("?/") & set(text)]
 
 
 def batch(report: Report, step: int = 0, **changes: Any) -> dict[str, Any]:

@@ -74,12 +74,12 @@ def ownership(engine: Engine) -> LeasedOwnership:
 
 def test_an_edge_names_the_owner_of_a_mission_and_records_nothing(start: Start, report: Report) -> None:
     one, _ = start()
-    owed = fly(one, report, range(2))
+    pending = fly(one, report, range(2))
     before = mission(one)
     other, _ = start("two")
-    outcome = {"mission_id": "test", **owed[0]}
+    outcome = {"mission_id": "test", **pending[0]}
     refusals = [
-        other.post("/decide", json=report(step=2, outcome=owed[0]), headers={"Idempotency-Key": "k"}),
+        other.post("/decide", json=report(step=2, outcome=pending[0]), headers={"Idempotency-Key": "k"}),
         other.post("/decide/batch", json={"mission_id": "test", "step": 2, "uavs": [_uav(report(step=2))]}),
         other.post("/feedback", json=outcome),
         other.put("/missions/test", json={}),
@@ -153,10 +153,10 @@ def test_an_edge_takes_over_what_is_free_and_the_former_owner_writes_nothing(
     start: Start, report: Report, database: sa.Connection
 ) -> None:
     one, engine = start()
-    owed = fly(one, report, range(2))
+    pending = fly(one, report, range(2))
     leave(database)
     two, _ = start("two")
-    fly(two, report, range(2, 4), owed)
+    fly(two, report, range(2, 4), pending)
     flown = mission(two)
     # The first does not know yet: by its own clock the lease is valid.
     assert ownership(engine).owns("test")
@@ -176,18 +176,22 @@ def test_an_outcome_a_note_and_a_deletion_of_a_former_owner_are_refused(
     start: Start, report: Report, database: sa.Connection
 ) -> None:
     requests: list[Callable[[httpx.Client, Body], httpx.Response]] = [
-        lambda client, owed: client.post("/feedback", json={"mission_id": "test", **owed}),
-        lambda client, owed: client.post("/feedback", json=owed),
+        lambda client, pending: client.post("/feedback", json={"mission_id": "test", **pending}),
+        lambda client, pending: client.post("/feedback", json=pending),
         lambda client, _: client.post("/missions/test/guidance", json={"note": "hover"}),
         lambda client, _: client.delete("/missions/test"),
     ]
     edges = [start("one", mode="policy")[0], start("two", mode="policy")[0]]
     for turn, request in enumerate(requests):
         former, present = edges[turn % 2], edges[1 - turn % 2]
-        owed = {"decision_id": stored_decision(former, report(step=turn))["decision_id"], "cost": 0.5, "failed": False}
+        pending = {
+            "decision_id": stored_decision(former, report(step=turn))["decision_id"],
+            "cost": 0.5,
+            "failed": False,
+        }
         leave(database)
         before = mission(present)
-        refused = request(former, owed)
+        refused = request(former, pending)
         assert (refused.status_code, "Retry-After" in refused.headers) == (503, True), refused.text
         assert mission(present) == before
         leave(database)
@@ -319,8 +323,8 @@ def test_the_metrics_count_leases(start: Start, report: Report, database: sa.Con
     for each in (engine, second):
         ownership(each)._renew()
     until(lambda: "aicvds_leases_lost_total 1.0" in one.get("/metrics").text)
-    told = two.get("/metrics").text
-    assert "aicvds_leases 1.0" in told and "aicvds_leases_taken_over_total 1.0" in told
+    reported = two.get("/metrics").text
+    assert "aicvds_leases 1.0" in reported and "aicvds_leases_taken_over_total 1.0" in reported
 
 
 def test_a_client_follows_to_the_owner(start: Start, postgres: str, report: Report) -> None:
@@ -343,17 +347,17 @@ def test_an_edge_that_was_paused_past_its_term_writes_nothing(
         httpx.Client(base_url=url, timeout=PATIENCE_S) as owner,
         ThreadPoolExecutor(2) as pool,
     ):
-        owed = fly(owner, report, range(2))
+        pending = fly(owner, report, range(2))
         successor, _ = start("two")
         paused.send_signal(signal.SIGSTOP)
         try:
-            outcome = {"mission_id": "test", **owed.pop(0)}
+            outcome = {"mission_id": "test", **pending.pop(0)}
             waiting = [
                 pool.submit(httpx.post, f"{url}{path}", json=body, timeout=PATIENCE_S)
                 for path, body in (("/decide", report(step=9)), ("/feedback", outcome))
             ]
             until(lambda: successor.get("/missions/test").status_code == 200)
-            fly(successor, report, range(2, 4), owed)
+            fly(successor, report, range(2, 4), pending)
             flown = mission(successor)
         finally:
             paused.send_signal(signal.SIGCONT)
@@ -363,8 +367,8 @@ def test_an_edge_that_was_paused_past_its_term_writes_nothing(
         assert owner.get("/missions/test").json()["owner"] == "http://two:8000"
         assert mission(successor) == flown
         # It was not recorded by the former owner.
-        told = successor.post("/feedback", json=outcome)
-        assert told.json()["result"] == "applied"
+        reported = successor.post("/feedback", json=outcome)
+        assert reported.json()["result"] == "applied"
 
 
 def test_no_client_is_sent_back_to_the_edge_that_it_asked(

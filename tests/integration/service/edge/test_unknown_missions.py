@@ -45,11 +45,11 @@ ASKS: list[Ask] = [decide, decide_batch, decide_with_key, decide_from_a_base]
 
 def refused(answer: httpx.Response, mission_id: str) -> None:
     """The answer names the mission and what to do."""
-    told = answer.json()
+    reported = answer.json()
     assert (answer.status_code, answer.headers["Content-Type"]) == (404, "application/problem+json"), answer.text
-    assert [fault["field"] for fault in told["errors"]] == ["mission_id"]
+    assert [fault["field"] for fault in reported["errors"]] == ["mission_id"]
     for part in (f"no mission {mission_id}:", f"PUT /missions/{mission_id}", "AICVDS_CREATE_ON_DECIDE=on"):
-        assert part in told["detail"]
+        assert part in reported["detail"]
 
 
 def listed(client: httpx.Client) -> list[str]:

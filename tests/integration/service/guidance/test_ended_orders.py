@@ -34,8 +34,8 @@ NOTED_IN_WORDS = "Visit sensor 3 at least once in every 3 steps."
 def say(client: httpx.Client, **answer: Any) -> dict[str, Any]:
     response = client.post(AT, json=answer)
     assert response.status_code == 200, response.text
-    told: dict[str, Any] = response.json()
-    return told
+    reported: dict[str, Any] = response.json()
+    return reported
 
 
 @pytest.mark.parametrize(
@@ -63,15 +63,15 @@ def test_orders_in_force_can_be_withdrawn_whatever_the_note(
             say(client, answer="reject")
         before = guidance(client, state)
         assert before["obeyed_in_words"] == "Never fly faster than 3 m/s."
-        told = say(client, answer=answer)
-        assert told["obeyed_in_words"] is None
-        assert (told["begun"], told["ended"]) == ([], ["Never fly faster than 3 m/s."])
+        reported = say(client, answer=answer)
+        assert reported["obeyed_in_words"] is None
+        assert (reported["begun"], reported["ended"]) == ([], ["Never fly faster than 3 m/s."])
         # What became of the note stays: an own structure that was withdrawn counts as rejected.
-        assert told["status"] == ("rejected" if state == "confirmed" else state)
-        assert [told[name] for name in ("note", "failure")] == [before[name] for name in ("note", "failure")]
+        assert reported["status"] == ("rejected" if state == "confirmed" else state)
+        assert [reported[name] for name in ("note", "failure")] == [before[name] for name in ("note", "failure")]
         assert client.post("/decide", json=report()).json()["velocity"] > 3
         # Withdrawn twice is withdrawn.
-        assert say(client, answer="withdraw") == told
+        assert say(client, answer="withdraw") == reported
 
 
 @pytest.mark.parametrize("ends", [{}, {"max_velocity": {"steps": 1}}])
@@ -123,10 +123,14 @@ def test_orders_are_withdrawn_beside_a_reading_that_still_waits(edge: Edge) -> N
         say(client, guidance=OWN)
         say(client, note=NOTE)
         guidance(client, "proposed")
-        told = say(client, answer="withdraw")
-        assert (told["status"], told["obeyed_in_words"], told["in_words"]) == ("proposed", None, NOTED_IN_WORDS)
+        reported = say(client, answer="withdraw")
+        assert (reported["status"], reported["obeyed_in_words"], reported["in_words"]) == (
+            "proposed",
+            None,
+            NOTED_IN_WORDS,
+        )
         # Nothing is left that a confirmation ends.
-        assert (told["begins"], told["ends"]) == ([NOTED_IN_WORDS], [])
+        assert (reported["begins"], reported["ends"]) == ([NOTED_IN_WORDS], [])
         assert say(client, answer="confirm")["obeyed_in_words"] == NOTED_IN_WORDS
 
 
@@ -158,9 +162,9 @@ def test_what_a_confirmation_ends_is_said_before_and_after_and_in_the_journal(ed
         assert (third["begins"], third["ends"]) == ([fourth_step], [NOTED_IN_WORDS])
         limit = "Never fly faster than 9 m/s."
         assert (third["stays"], third["ends_if_replaced"]) == ([limit], [NOTED_IN_WORDS, limit])
-        told = say(client, answer="confirm", change="replace")
-        assert (told["begins"], told["ends"]) == ([], [])
-        assert (told["begun"], told["ended"]) == (third["begins"], third["ends_if_replaced"])
+        reported = say(client, answer="confirm", change="replace")
+        assert (reported["begins"], reported["ends"]) == ([], [])
+        assert (reported["begun"], reported["ended"]) == (third["begins"], third["ends_if_replaced"])
         # A structure takes effect at once, so that this is said afterwards.
         own = say(client, guidance=OWN, change="replace")
         assert (own["begun"], own["ended"]) == (OWN_IN_WORDS, [fourth_step])
@@ -169,7 +173,7 @@ def test_what_a_confirmation_ends_is_said_before_and_after_and_in_the_journal(ed
         db.close()
     events = [decode("guided", body) for (body,) in rows]
     written = [(event.state["begun"], event.state["ended"]) for event in events if isinstance(event, GuidanceChanged)]
-    assert written == [(own["begun"], own["ended"]), (told["begun"], told["ended"])]
+    assert written == [(own["begun"], own["ended"]), (reported["begun"], reported["ended"])]
 
 
 def test_of_two_operators_the_second_answers_no_reading_that_he_has_not_seen(edge: Edge) -> None:
@@ -202,9 +206,9 @@ def test_an_edge_that_was_killed_withdraws_the_orders_of_before(tmp_path: Path) 
         process.kill()
     with serving_edge(**env) as (url, process), httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
         assert guidance(client, "failed") == before
-        told = say(client, answer="withdraw", version=before["version"])
-        assert (told["obeyed_in_words"], told["ended"]) == (None, OWN_IN_WORDS)
+        reported = say(client, answer="withdraw", version=before["version"])
+        assert (reported["obeyed_in_words"], reported["ended"]) == (None, OWN_IN_WORDS)
         process.kill()
     later = create_app(Settings(mode="value"), StoreHere(tmp_path / "missions.db"))
     with serving(later) as url, httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
-        assert client.get(AT).json() == told
+        assert client.get(AT).json() == reported

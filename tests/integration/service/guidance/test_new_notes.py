@@ -18,13 +18,16 @@ def test_a_new_note_is_compiled_while_the_orders_before_it_stay(edge: Edge) -> N
         client.post("/missions/test/guidance", json={"answer": "confirm"})
         new = {"note": "Look at sensor 2 every 4 steps."}
         assert client.post("/missions/test/guidance", json=new).status_code == 200
-        told = guidance(client, "proposed")
-        assert (told["note"], told["in_words"]) == (new["note"], "Visit sensor 2 at least once in every 4 steps.")
-        assert told["obeyed_in_words"] == "Visit sensor 3 at least once in every 3 steps."
+        reported = guidance(client, "proposed")
+        assert (reported["note"], reported["in_words"]) == (
+            new["note"],
+            "Visit sensor 2 at least once in every 4 steps.",
+        )
+        assert reported["obeyed_in_words"] == "Visit sensor 3 at least once in every 3 steps."
         # A rejected proposal leaves the orders before it, also where a client sends its answer again.
         for _ in range(2):
             rejected = client.post("/missions/test/guidance", json={"answer": "reject"}).json()
-            assert (rejected["status"], rejected["obeyed_in_words"]) == ("rejected", told["obeyed_in_words"])
+            assert (rejected["status"], rejected["obeyed_in_words"]) == ("rejected", reported["obeyed_in_words"])
         assert client.post("/missions/test/guidance", json={"answer": "withdraw"}).json()["obeyed_in_words"] is None
         # The mission's spec is the same: the PUT that made it changes nothing.
         assert client.put("/missions/test", json={"mode": "value", "note": NOTE}).status_code == 200

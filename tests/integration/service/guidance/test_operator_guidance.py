@@ -69,14 +69,14 @@ class Scribe(StubLlm):
 
 def guidance(client: httpx.Client, status: str) -> dict[str, Any]:
     """The mission's guidance once it is in that state."""
-    told: dict[str, Any] = {}
+    reported: dict[str, Any] = {}
 
     def there() -> bool:
-        told.update(client.get("/missions/test/guidance").json())
-        return bool(told["status"] == status)
+        reported.update(client.get("/missions/test/guidance").json())
+        return bool(reported["status"] == status)
 
-    until(there, lambda: f"the guidance is to be {status}: {told}")
-    return told
+    until(there, lambda: f"the guidance is to be {status}: {reported}")
+    return reported
 
 
 def test_a_note_is_compiled_proposed_and_obeyed_only_once_confirmed(edge: Edge, report: Report) -> None:
@@ -85,8 +85,8 @@ def test_a_note_is_compiled_proposed_and_obeyed_only_once_confirmed(edge: Edge, 
         client = edge(mode="llm", llm_url=f"{url}/v1")
         wait_for(client, "ready")
         assert client.put("/missions/test", json={"mode": "value", "note": NOTE}).status_code == 200
-        told = guidance(client, "proposed")
-        assert told == {
+        reported = guidance(client, "proposed")
+        assert reported == {
             "mission_id": "test",
             "status": "proposed",
             "note": NOTE,
@@ -109,7 +109,7 @@ def test_a_note_is_compiled_proposed_and_obeyed_only_once_confirmed(edge: Edge, 
             "begun": [],
             "ended": [],
             "orders": [],
-            "version": told["version"],
+            "version": reported["version"],
         }
         # At step 2 sensor 3 is due, and its queue is the shortest.
         assert client.post("/decide", json=report(step=2)).json()["sensor_id"] != 3
@@ -149,8 +149,8 @@ def test_what_cannot_be_made_sense_of_fails_and_the_operators_own_still_counts(
     with serving(Scribe(orders).app) as url:
         client = edge(mode="llm", llm_url=f"{url}/v1")
         client.put("/missions/test", json={"note": note})
-        told = guidance(client, "failed")
-        assert why in told["failure"] and told["guidance"] is None
+        reported = guidance(client, "failed")
+        assert why in reported["failure"] and reported["guidance"] is None
         nothing = client.post("/missions/test/guidance", json={"answer": "confirm"})
         assert (nothing.status_code, fields(nothing)) == (409, ["answer"])
         own = client.post("/missions/test/guidance", json={"guidance": OWN}).json()

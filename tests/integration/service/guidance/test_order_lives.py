@@ -29,22 +29,22 @@ def ended(**end: Any) -> dict[str, Any]:
     return {**LEAK, "max_velocity": 8, "ends": {"max_velocity": end}}
 
 
-def spans(told: dict[str, Any]) -> list[tuple[str, int, int | None]]:
-    return [(order["name"], order["since_step"], order["until_step"]) for order in told["orders"]]
+def spans(reported: dict[str, Any]) -> list[tuple[str, int, int | None]]:
+    return [(order["name"], order["since_step"], order["until_step"]) for order in reported["orders"]]
 
 
 def test_a_second_structure_is_added_unless_it_is_a_replacement(edge: Edge) -> None:
     client = edge()
     client.put("/missions/test", json={})
     say(client, guidance=LEAK)
-    told = say(client, guidance={"max_velocity": 8})
-    assert (told["obeyed_in_words"], told["ended"]) == (f"{VISIT}. {SLOW}.", [])
+    reported = say(client, guidance={"max_velocity": 8})
+    assert (reported["obeyed_in_words"], reported["ended"]) == (f"{VISIT}. {SLOW}.", [])
     # Another limit replaces just that one.
-    told = say(client, guidance={"max_velocity": 6})
-    assert told["ended"] == [f"{SLOW}."]
-    told = say(client, guidance={"min_velocity": 2}, change="replace")
-    assert told["obeyed_in_words"] == "Never fly slower than 2 m/s."
-    assert [(order["name"], order["until"] is None) for order in told["orders"]] == [
+    reported = say(client, guidance={"max_velocity": 6})
+    assert reported["ended"] == [f"{SLOW}."]
+    reported = say(client, guidance={"min_velocity": 2}, change="replace")
+    assert reported["obeyed_in_words"] == "Never fly slower than 2 m/s."
+    assert [(order["name"], order["until"] is None) for order in reported["orders"]] == [
         ("max_velocity", False),
         ("visit:4", False),
         ("max_velocity", False),
@@ -57,9 +57,9 @@ def test_one_order_is_withdrawn_by_its_name(edge: Edge, report: Report) -> None:
     client.put("/missions/test", json={})
     say(client, guidance={**LEAK, "max_velocity": 3})
     client.post("/decide", json=report(step=5))
-    told = say(client, answer="withdraw", orders=["max_velocity"])
-    assert (told["status"], told["obeyed_in_words"]) == ("confirmed", f"{VISIT}.")
-    assert spans(told) == [("max_velocity", 0, 6), ("visit:4", 0, None)]
+    reported = say(client, answer="withdraw", orders=["max_velocity"])
+    assert (reported["status"], reported["obeyed_in_words"]) == ("confirmed", f"{VISIT}.")
+    assert spans(reported) == [("max_velocity", 0, 6), ("visit:4", 0, None)]
     assert client.post("/decide", json=report(step=6)).json()["velocity"] > 3
     unknown = client.post(AT, json={"answer": "withdraw", "orders": ["max_velocity"]})
     assert (unknown.status_code, fields(unknown)) == (409, ["orders"])
@@ -72,9 +72,9 @@ def test_orders_are_said_and_withdrawn_by_the_users_names_too(edge: Edge) -> Non
     client.put("/missions/test", json={"names": {"sensors": ["a", "b", None, "c", "kp-1.58"]}})
     named = VISIT.replace("sensor 4", "sensor 4 (kp-1.58)")
     assert say(client, guidance=LEAK)["obeyed_in_words"] == f"{named}."
-    told = say(client, answer="withdraw", orders=["visit:kp-1.58"])
-    assert (told["obeyed_in_words"], told["ended"]) == (None, [f"{named}."])
-    assert [(order["name"], order["in_words"]) for order in told["orders"]] == [("visit:4", f"{named}.")]
+    reported = say(client, answer="withdraw", orders=["visit:kp-1.58"])
+    assert (reported["obeyed_in_words"], reported["ended"]) == (None, [f"{named}."])
+    assert [(order["name"], order["in_words"]) for order in reported["orders"]] == [("visit:4", f"{named}.")]
 
 
 def test_an_ended_order_says_why(edge: Edge, report: Report) -> None:
@@ -83,8 +83,8 @@ def test_an_ended_order_says_why(edge: Edge, report: Report) -> None:
     say(client, guidance={**ended(step=1), "min_velocity": 1})
     client.post("/decide", json=report(step=1))
     say(client, guidance={"min_velocity": 2})
-    told = say(client, answer="withdraw")
-    reasons = {(order["name"], order["in_words"][-6:]): order["why"] for order in told["orders"]}
+    reported = say(client, answer="withdraw")
+    reasons = {(order["name"], order["in_words"][-6:]): order["why"] for order in reported["orders"]}
     assert reasons == {
         ("max_velocity", "tep 1."): "its own end",
         ("min_velocity", " 1 m/s."[-6:]): "replaced",
@@ -123,15 +123,18 @@ def test_a_late_visit_is_an_alarm_of_the_mission(edge: Edge, report: Report) -> 
 def test_an_order_ends_at_its_step(edge: Edge, report: Report, end: dict[str, Any], path: str) -> None:
     client = edge()
     client.put("/missions/test", json={})
-    told = say(client, guidance={**ended(**end), "max_velocity": 2})
-    assert told["obeyed_in_words"] == f"{VISIT}. Never fly faster than 2 m/s, until step 3."
+    reported = say(client, guidance={**ended(**end), "max_velocity": 2})
+    assert reported["obeyed_in_words"] == f"{VISIT}. Never fly faster than 2 m/s, until step 3."
     # The last decisions of the steps before it too, which come after the first UAV's.
     asked = [[report(step=step, uav_id=uav) for uav in range(3)] for step in range(4)]
     velocities = [max(decision["velocity"] for decision in decide(client, path, *bodies)) for bodies in asked]
     assert max(velocities[:3]) <= 2 < velocities[3]
-    told = client.get(AT).json()
-    assert (told["obeyed_in_words"], told["ended"]) == (f"{VISIT}.", ["Never fly faster than 2 m/s, until step 3."])
-    assert spans(told) == [("max_velocity", 0, 3), ("visit:4", 0, None)]
+    reported = client.get(AT).json()
+    assert (reported["obeyed_in_words"], reported["ended"]) == (
+        f"{VISIT}.",
+        ["Never fly faster than 2 m/s, until step 3."],
+    )
+    assert spans(reported) == [("max_velocity", 0, 3), ("visit:4", 0, None)]
     late = client.post(AT, json={"guidance": ended(step=4)})
     assert (late.status_code, fields(late)) == (422, ["guidance.ends.max_velocity.step"])
 
@@ -176,8 +179,8 @@ def test_a_decision_that_waits_for_the_llm_obeys_orders_that_are_confirmed_meanw
         until(lambda: gate.callers)
         say(client, guidance={"min_velocity": 1, "max_velocity": 1})
         gate.open()
-        told = waiting.result().json()
-        assert (told["velocity"], told["reason"]) == (1, reason)
+        reported = waiting.result().json()
+        assert (reported["velocity"], reported["reason"]) == (1, reason)
 
 
 def test_an_order_ends_with_a_visit_that_succeeded(edge: Edge, report: Report) -> None:
@@ -194,8 +197,8 @@ def test_an_order_ends_with_a_visit_that_succeeded(edge: Edge, report: Report) -
         assert client.get(AT).json()["obeyed_in_words"] == words
         client.post("/feedback", json={"decision_id": decision["decision_id"], "cost": 0.0, "failed": failed})
     client.post("/decide", json=report(step=3))
-    told = client.get(AT).json()
-    assert (told["obeyed_in_words"], spans(told)) == (None, [(f"visit:{sensor}", 1, 3)])
+    reported = client.get(AT).json()
+    assert (reported["obeyed_in_words"], spans(reported)) == (None, [(f"visit:{sensor}", 1, 3)])
     # A single visit has no interval, and so no deadlines.
     assert "deadlines" not in client.get("/missions/test").json()
 
@@ -211,20 +214,20 @@ def test_an_order_that_ends_between_two_decisions_of_a_step_was_in_force_in_that
     assert (decision["sensor_id"], decision["velocity"] <= 2) == (sensor, True)
     client.post("/feedback", json={"decision_id": decision["decision_id"], "cost": 0.0})
     client.post("/decide", json=report(step=1, uav_id=1))
-    told = client.get(AT).json()
-    assert (told["obeyed_in_words"], spans(told)) == (None, [("max_velocity", 1, 2)])
+    reported = client.get(AT).json()
+    assert (reported["obeyed_in_words"], spans(reported)) == (None, [("max_velocity", 1, 2)])
 
 
 def test_ends_and_records_are_kept_through_a_restart(report: Report, tmp_path: Path) -> None:
     env = {"AICVDS_STORE": str(tmp_path / "missions.db"), "AICVDS_MODE": "value"}
-    told: dict[str, Any] = {}
+    reported: dict[str, Any] = {}
     for step in range(3):
         with serving_edge(**env) as (url, process), httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
             if step == 0:
                 client.put("/missions/test", json={})
-                told = say(client, guidance=ended(steps=2))
-            assert client.get(AT).json() == told
+                reported = say(client, guidance=ended(steps=2))
+            assert client.get(AT).json() == reported
             assert client.post("/decide", json=report(step=step)).status_code == 200
-            told = client.get(AT).json()
+            reported = client.get(AT).json()
             process.kill()
-    assert spans(told) == [("max_velocity", 0, 2), ("visit:4", 0, None)]
+    assert spans(reported) == [("max_velocity", 0, 2), ("visit:4", 0, None)]

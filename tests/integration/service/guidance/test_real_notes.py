@@ -45,9 +45,9 @@ def read(client: httpx.Client, note: str, before: dict[str, Any] | None) -> dict
     if before is not None:
         assert client.post(f"{mission}/guidance", json={"guidance": before}).status_code == 200
     assert client.post(f"{mission}/guidance", json={"note": note}).status_code == 200
-    while (told := client.get(f"{mission}/guidance").json())["status"] == "compiling":
+    while (reported := client.get(f"{mission}/guidance").json())["status"] == "compiling":
         time.sleep(0.05)
-    return dict(told)
+    return dict(reported)
 
 
 @pytest.mark.parametrize(
@@ -71,11 +71,11 @@ def read(client: httpx.Client, note: str, before: dict[str, Any] | None) -> dict
 def test_a_note_becomes_what_its_operator_means(
     client: httpx.Client, note: str, before: dict[str, Any] | None, ends: list[str], after: list[str]
 ) -> None:
-    told = read(client, note, before)
-    assert (told["status"], told["ends"]) == ("proposed", ends), told
+    reported = read(client, note, before)
+    assert (reported["status"], reported["ends"]) == ("proposed", ends), reported
     # Nothing of the note is missing, and so no doubt says it.
-    assert not any("In no order" in doubt or "by itself" in doubt for doubt in told["doubts"])
-    confirmed = client.post(f"/missions/{told['mission_id']}/guidance", json={"answer": "confirm"}).json()
+    assert not any("In no order" in doubt or "by itself" in doubt for doubt in reported["doubts"])
+    confirmed = client.post(f"/missions/{reported['mission_id']}/guidance", json={"answer": "confirm"}).json()
     assert sorted(order["in_words"] for order in confirmed["orders"] if order["until"] is None) == sorted(after)
 
 
@@ -88,16 +88,16 @@ def test_a_note_becomes_what_its_operator_means(
     ],
 )
 def test_words_that_are_in_no_order_are_quoted(client: httpx.Client, note: str, words: str) -> None:
-    told = read(client, note, None)
-    assert told["in_words"] == VISIT
-    assert any(f"“{words}”" in doubt for doubt in told["doubts"]), told["doubts"]
+    reported = read(client, note, None)
+    assert reported["in_words"] == VISIT
+    assert any(f"“{words}”" in doubt for doubt in reported["doubts"]), reported["doubts"]
 
 
 @pytest.mark.parametrize("note", ["Slow down.", "Never visit sensor 4 every 3 steps.", "Don't cancel all orders."])
 def test_what_is_not_understood_says_so_and_changes_nothing(client: httpx.Client, note: str) -> None:
-    told = read(client, note, LEAK)
-    assert (told["status"], told["obeyed_in_words"]) == ("failed", VISIT)
-    assert "unclear" in told["failure"]
+    reported = read(client, note, LEAK)
+    assert (reported["status"], reported["obeyed_in_words"]) == ("failed", VISIT)
+    assert "unclear" in reported["failure"]
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_what_is_not_understood_says_so_and_changes_nothing(client: httpx.Client
     ],
 )
 def test_no_note_begins_the_opposite_of_what_it_says(client: httpx.Client, note: str) -> None:
-    told = read(client, note, LEAK_AND_LIMIT)
-    assert told["begins"] == [], told
+    reported = read(client, note, LEAK_AND_LIMIT)
+    assert reported["begins"] == [], reported
     # It ends the order, is refused, or has a doubt.
-    assert told["status"] == "failed" or told["ends"] or told["doubts"]
+    assert reported["status"] == "failed" or reported["ends"] or reported["doubts"]

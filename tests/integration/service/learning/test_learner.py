@@ -71,8 +71,8 @@ def test_a_lessons_gradient_is_autograds(preset: Features, sensors: int) -> None
         expected = torch.autograd.grad(loss, list(modules.parameters()))
         weights = modules.weights()
         found = weights.layout.arrays(np.zeros_like(weights.flat))
-        told = descend(weights.parameters, case, -cost, into=found)
-        assert told == pytest.approx(loss.item(), rel=1e-4, abs=1e-9)
+        reported = descend(weights.parameters, case, -cost, into=found)
+        assert reported == pytest.approx(loss.item(), rel=1e-4, abs=1e-9)
         for name, mine, its in zip(weights.layout.names, found, expected, strict=True):
             atol = 1e-5 * (1 + float(its.abs().max()))
             np.testing.assert_allclose(mine, its.numpy(), rtol=1e-3, atol=atol, err_msg=name)

@@ -42,8 +42,7 @@ def watching(client: httpx.Client, mission: str = "test", **headers: str) -> Ite
     with client.stream("GET", f"/missions/{mission}/events", headers=headers) as answer:
         assert answer.status_code == 200, answer.read()
         assert answer.headers["content-type"].startswith("text/event-stream")
-        # Seen of nginx 1.22 with `gzip_types *`: without this it sends nothing before the end.
-        assert answer.headers["x-accel-buffering"] == "no"
+        assert answer.headers["x-accel-buffering"] == "no"  # Or nginx 1.22 with `gzip_types *` sends nothing.
         yield parsed(answer.iter_lines())
 
 
@@ -69,7 +68,7 @@ def test_a_listener_gets_a_snapshot_and_then_what_changes(edge: Edge, report: Re
     with watching(client) as events:
         name, whole = next(events)
         assert name == "snapshot"
-        assert [told["answer"]["decision_id"] for told in whole["decisions"]] == [first]
+        assert [reported["answer"]["decision_id"] for reported in whole["decisions"]] == [first]
         assert whole["decisions"][0]["position"] == [500.0, 450.0]
         assert whole["decisions"][0]["answer"]["latency_ms"].keys() >= {"store", "total"}
         assert whole["places"][0] == [420.0, 380.0]
@@ -78,14 +77,14 @@ def test_a_listener_gets_a_snapshot_and_then_what_changes(edge: Edge, report: Re
         assert len(whole["trajectories"]) == 3
         outcome = {"decision_id": first, "cost": 0.25, "failed": True, "round_trip_ms": 41.5}
         second = decided(client, report(step=1, outcome=outcome))
-        told: list[str] = []
+        reported: list[str] = []
         heard: list[Any] = []
-        while not (told and heard):
+        while not (reported and heard):
             name, update = next(events)
             assert name == "update"
-            told += [one["answer"]["decision_id"] for one in update["decisions"]]
+            reported += [one["answer"]["decision_id"] for one in update["decisions"]]
             heard += update["outcomes"]
-        assert told == [second]
+        assert reported == [second]
         assert heard == [outcome]
         assert (update["step"], update["made"], update["settled"]) == (1, 2, 1)
         flown = update["uavs"]["0"]
@@ -128,9 +127,9 @@ def test_the_missions_are_listed_the_one_that_decided_last_first(edge: Edge, rep
     client.put("/missions/waits", json={"mode": "policy"})
     for named in ("a", "b", "a"):
         decided(client, report(mission_id=named))
-    told = client.get("/missions").json()
-    assert told["newest"] == "a"
-    assert [(one["mission_id"], one["mode"], one["decisions"]) for one in told["missions"]] == [
+    reported = client.get("/missions").json()
+    assert reported["newest"] == "a"
+    assert [(one["mission_id"], one["mode"], one["decisions"]) for one in reported["missions"]] == [
         ("a", "value", 2),
         ("b", "value", 1),
         ("waits", "policy", 0),
@@ -140,10 +139,10 @@ def test_the_missions_are_listed_the_one_that_decided_last_first(edge: Edge, rep
 def test_a_decisions_prompt_is_told_while_it_is_kept(edge: Edge, report: Report) -> None:
     client = edge()
     name = decided(client, report())
-    told = client.get(f"/missions/test/decisions/{name}/prompt").json()
-    assert told["static"].startswith("You schedule data collection")
-    assert told["state"].count("\n") == 6
-    assert told["asked"] is False
+    reported = client.get(f"/missions/test/decisions/{name}/prompt").json()
+    assert reported["static"].startswith("You schedule data collection")
+    assert reported["state"].count("\n") == 6
+    assert reported["asked"] is False
     decided(client, report(mission_id="other"))
     for named, decision in (("other", name), ("test", "0" * 32)):
         assert client.get(f"/missions/{named}/decisions/{decision}/prompt").status_code == 404
@@ -368,10 +367,10 @@ def test_a_decision_is_shown_with_its_outcome() -> None:
 
 def test_a_round_trip_is_in_no_journal_and_old_journals_are_read() -> None:
     bare = Outcome(decision_id="a" * 32, cost=0.5, failed=True)
-    told = bare.model_copy(update={"round_trip_ms": 12.5})
-    assert encode(Settled(told, True)) == encode(Settled(bare, True))
+    reported = bare.model_copy(update={"round_trip_ms": 12.5})
+    assert encode(Settled(reported, True)) == encode(Settled(bare, True))
     old = pack([{"decision_id": "a" * 32, "cost": 0.5, "failed": True}, True])
-    assert encode(Settled(told, True))[1] == old
+    assert encode(Settled(reported, True))[1] == old
     assert decode("settled", old) == Settled(bare, True)
 
 
@@ -397,5 +396,5 @@ def test_a_decision_without_candidates_has_a_prompt_in_no_other_words(edge: Edge
     client = edge(llm_adapter="served")
     client.put("/missions/test", json={"mode": "policy", "prompt": {"format": "compact"}})
     name = decided(client, report())
-    told = client.get(f"/missions/test/decisions/{name}/prompt")
-    assert (told.status_code, told.json()["in_words"]) == (200, [])
+    reported = client.get(f"/missions/test/decisions/{name}/prompt")
+    assert (reported.status_code, reported.json()["in_words"]) == (200, [])

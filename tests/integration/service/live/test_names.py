@@ -51,10 +51,10 @@ def test_a_note_with_names_is_read_as_ids_and_shown_with_both(edge: Edge) -> Non
         client = edge(mode="llm", llm_url=f"{url}/v1")
         wait_for(client, "ready")
         client.put("/missions/test", json=SPEC | {"note": "Leak at KP-1.58, kp-1.5: visit it every 3 steps."})
-        told = guidance(client, "proposed")
-        assert told["note"] == "Leak at KP-1.58, kp-1.5: visit it every 3 steps."
-        assert told["guidance"]["sensors"][0]["sensor_id"] == 3
-        assert "“kp-1.5” is no name of this mission." in told["doubts"]
+        reported = guidance(client, "proposed")
+        assert reported["note"] == "Leak at KP-1.58, kp-1.5: visit it every 3 steps."
+        assert reported["guidance"]["sensors"][0]["sensor_id"] == 3
+        assert "“kp-1.5” is no name of this mission." in reported["doubts"]
         shown = snapshot(client, "test")["guidance"]
         assert isinstance(shown, dict)
         assert shown["in_words"] == "Visit sensor 3 (kp-1.58) at least once in every 3 steps."

@@ -25,8 +25,8 @@ def test_a_later_listener_gets_the_ages_of_his_own_time(
         assert next(early)[1]["idle_s"] < 3600.0
         clock.ahead_s = 3600.0
         with watching(client) as late:
-            told = next(late)[1]
-    assert told["idle_s"] >= 3600.0 and told["uavs"]["0"]["heard_s"] >= 3600.0
+            reported = next(late)[1]
+    assert reported["idle_s"] >= 3600.0 and reported["uavs"]["0"]["heard_s"] >= 3600.0
 
 
 def test_a_sensors_own_reading_reaches_an_open_page(edge: Edge, report: Report) -> None:
@@ -58,8 +58,8 @@ def test_a_uav_that_is_late_is_shown_where_it_is_believed_to_be(edge: Edge, repo
         if step < 2:
             decided(client, report(step=step, uav_id=1))
     with watching(client) as events:
-        told = next(events)[1]["uavs"]
-    assert [(told[uav]["step"], told[uav]["position_step"]) for uav in "01"] == [(2, 2), (1, 2)]
+        reported = next(events)[1]["uavs"]
+    assert [(reported[uav]["step"], reported[uav]["position_step"]) for uav in "01"] == [(2, 2), (1, 2)]
 
 
 def test_a_new_visit_order_is_due_by_its_own_first_step_and_a_late_uav_shows_its_report(
@@ -73,10 +73,10 @@ def test_a_new_visit_order_is_due_by_its_own_first_step_and_a_late_uav_shows_its
     order = {"guidance": {"sensors": [{"sensor_id": 9, "visit_every": 3}]}}
     assert client.post("/missions/test/guidance", json=order).status_code == 200
     with watching(client) as events:
-        told = next(events)[1]
-    [since] = [one["since_step"] for one in told["guidance"]["orders"]]
-    assert since >= 5 and told["guidance"]["due"] == [{"sensor_id": 9, "visit_every": 3, "due": since + 2}]
-    assert [told["uavs"][number]["step"] for number in ("0", "1")] == [5, 4]
+        reported = next(events)[1]
+    [since] = [one["since_step"] for one in reported["guidance"]["orders"]]
+    assert since >= 5 and reported["guidance"]["due"] == [{"sensor_id": 9, "visit_every": 3, "due": since + 2}]
+    assert [reported["uavs"][number]["step"] for number in ("0", "1")] == [5, 4]
 
 
 def test_a_fleet_that_is_silent_since_before_a_restart_is_lost(

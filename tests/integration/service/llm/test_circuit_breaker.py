@@ -66,9 +66,9 @@ def test_a_server_that_hangs_keeps_three_waiting_and_is_asked_again_when_it_is_w
         assert reasons == ["llm_timeout"] * 3 + ["llm_unavailable"] * 2
         ready = client.get("/readyz").json()
         assert ready["llm"] == "unavailable" and "llm_timeout" in ready["detail"]
-        told = client.get("/metrics").text
-        assert "aicvds_llm_breaker_open 1.0" in told
-        assert 'aicvds_llm_servers{status="unavailable"} 1.0' in told
+        reported = client.get("/metrics").text
+        assert "aicvds_llm_breaker_open 1.0" in reported
+        assert 'aicvds_llm_servers{status="unavailable"} 1.0' in reported
         # The probe finds it well, and the next decision finds that it is not: one waits, not three.
         probes.open()
         wait_for(client, "ready")
@@ -81,10 +81,10 @@ def test_a_server_that_hangs_keeps_three_waiting_and_is_asked_again_when_it_is_w
         patient = [report(step=step, deadline_ms=60_000) for step in range(8, 10)]
         reasons = [client.post("/decide", json=body).json()["reason"] for body in patient]
         assert reasons == [None, None]
-        told = client.get("/metrics").text
-        assert "aicvds_llm_breaker_opened_total 2.0" in told
-        assert "aicvds_llm_breaker_open 0.0" in told
-        assert 'aicvds_llm_servers{status="ready"} 1.0' in told
+        reported = client.get("/metrics").text
+        assert "aicvds_llm_breaker_opened_total 2.0" in reported
+        assert "aicvds_llm_breaker_open 0.0" in reported
+        assert 'aicvds_llm_servers{status="ready"} 1.0' in reported
 
 
 def test_who_hardly_waits_does_not_open_it(edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,8 +199,8 @@ def test_a_note_sent_while_it_is_open_is_compiled_when_it_is_well(
         assert client.get("/missions/test/guidance").json()["status"] == "compiling"
         probes.open()
         until(lambda: client.get("/missions/test/guidance").json()["status"] != "compiling")
-        told = client.get("/missions/test/guidance").json()
-    assert told["status"] == "proposed", told
+        reported = client.get("/missions/test/guidance").json()
+    assert reported["status"] == "proposed", reported
 
 
 def test_a_server_that_refuses_the_first_question_may_still_answer_others(edge: Edge, report: Report) -> None:

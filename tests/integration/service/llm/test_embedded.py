@@ -148,8 +148,8 @@ def test_decisions_and_health_go_on_while_the_model_loads(report: Report, monkey
     with serving(app) as url, httpx.Client(base_url=url, timeout=PATIENCE_S) as client, gate:
         until(lambda: gate.callers)
         assert client.get("/healthz").status_code == 200
-        told = client.get("/readyz").json()
-        assert (told["llm"], told["detail"]) == ("loading", "the embedded LLM has not answered yet")
+        reported = client.get("/readyz").json()
+        assert (reported["llm"], reported["detail"]) == ("loading", "the embedded LLM has not answered yet")
         assert client.post("/decide", json=report(mission_id="early")).json()["reason"] == "llm_loading"
         gate.open()
         wait_for(client, "ready")

@@ -144,8 +144,8 @@ def test_lists_that_do_not_fit_are_refused(given: dict[str, Any]) -> None:
 def test_each_server_gets_its_own_key_or_all_the_same() -> None:
     urls = "http://a/v1,http://b/v1/"
     each = Settings(llm_url=urls, llm_api_key="one,two").each_server()
-    told = [(s.llm_url, s.llm_api_key and s.llm_api_key.get_secret_value(), s.llm_model) for s in each]
-    assert told == [("http://a/v1", "one", None), ("http://b/v1", "two", None)]
+    reported = [(s.llm_url, s.llm_api_key and s.llm_api_key.get_secret_value(), s.llm_model) for s in each]
+    assert reported == [("http://a/v1", "one", None), ("http://b/v1", "two", None)]
     each = Settings(llm_url=urls, llm_api_key="one", llm_model="m,").each_server()
     assert [s.llm_model for s in each] == ["m", None]
     assert {s.llm_api_key and s.llm_api_key.get_secret_value() for s in each} == {"one"}

@@ -57,8 +57,8 @@ def test_the_same_batch_at_once_is_decided_once(tmp_path: Path, report: Report) 
             thread.start()
         for thread in threads:
             thread.join()
-        told = {tuple(d["decision_id"] for d in answer["decisions"]) for answer in answers}
-        assert len(told) == 1
+        reported = {tuple(d["decision_id"] for d in answer["decisions"]) for answer in answers}
+        assert len(reported) == 1
         assert client.get("/missions/test").json()["decisions"] == 3
 
 
@@ -75,8 +75,8 @@ def test_a_batch_counts_as_many_answers_as_it_has(tmp_path: Path, report: Report
     def ask(client: httpx.Client, number: int) -> str:
         body = {"mission_id": "test", "step": 0, "uavs": uavs}
         answer = client.post("/decide/batch", json=body, headers={"Idempotency-Key": f"k{number}"})
-        told: str = answer.json()["decisions"][0]["decision_id"]
-        return told
+        reported: str = answer.json()["decisions"][0]["decision_id"]
+        return reported
 
     with running(tmp_path / "m.db") as (client, engine):
         first = [ask(client, number) for number in range(10)]
@@ -119,13 +119,15 @@ def test_a_forged_outcome_does_not_refuse_the_fleet_its_batch(edge: Any, report:
     second = client.post("/decide/batch", json={"mission_id": "test", "step": 1, "uavs": uavs})
     assert (second.status_code, len(second.json()["decisions"])) == (200, 3)
     assert client.get("/missions/test").json()["feedback"] == 3
-    told = [record.getMessage() for record in caplog.records if record.name == "service.edge.feedback"]
-    assert len(told) == 1 and "mission test" in told[0] and ids[2] in told[0]
+    reported = [record.getMessage() for record in caplog.records if record.name == "service.edge.feedback"]
+    assert len(reported) == 1 and "mission test" in reported[0] and ids[2] in reported[0]
 
 
 def test_outcomes_may_come_in_any_order_but_not_too_late(edge: Any, report: Report) -> None:
     client = edge()
     ids = [client.post("/decide", json=report(step=step)).json()["decision_id"] for step in range(20)]
-    told = [client.post("/feedback", json={"mission_id": "test", "decision_id": i, "cost": 0.1}) for i in reversed(ids)]
-    assert [answer.status_code for answer in told] == [200] * 8 + [404] * 12
+    reported = [
+        client.post("/feedback", json={"mission_id": "test", "decision_id": i, "cost": 0.1}) for i in reversed(ids)
+    ]
+    assert [answer.status_code for answer in reported] == [200] * 8 + [404] * 12
     assert client.get("/missions/test").json()["feedback"] == 8

@@ -84,8 +84,8 @@ def test_the_status_names_failed_radios_wind_bursts_and_the_rate() -> None:
 
 
 def test_a_client_reads_the_status_of_a_newer_edge(edge: Edge) -> None:
-    told = edge().put("/missions/test", json={}).json()
-    newer = {**told, "learned": None, "something_new": [1, 2]}
+    reported = edge().put("/missions/test", json={}).json()
+    newer = {**reported, "learned": None, "something_new": [1, 2]}
     assert MissionStatus.model_validate_json(httpx.Response(200, json=newer).content).mission_id == "test"
 
 
@@ -97,9 +97,9 @@ def test_metrics_count_excess_losses_and_failures_over_good_links(edge: Edge, re
         outcome = {"decision_id": answer["decision_id"], "cost": 1.0, "failed": True}
     # Sent again, it counts once.
     client.post("/decide", json=body)
-    told = numbers(client)
-    assert told["aicvds_link_excess_db_count"] == 12
-    assert told['aicvds_link_excess_db_bucket{le="-6.0"}'] == 0
-    assert told['aicvds_link_excess_db_bucket{le="1.0"}'] == 6
-    assert told['aicvds_link_excess_db_bucket{le="10.0"}'] == 9
-    assert told["aicvds_radio_failures_total"] == 2
+    reported = numbers(client)
+    assert reported["aicvds_link_excess_db_count"] == 12
+    assert reported['aicvds_link_excess_db_bucket{le="-6.0"}'] == 0
+    assert reported['aicvds_link_excess_db_bucket{le="1.0"}'] == 6
+    assert reported['aicvds_link_excess_db_bucket{le="10.0"}'] == 9
+    assert reported["aicvds_radio_failures_total"] == 2

@@ -21,8 +21,8 @@ Edge = Callable[..., httpx.Client]
 def asked(client: httpx.Client, body: Body, **headers: str) -> Body:
     answer = client.post("/decide", json=body, headers=headers)
     assert answer.status_code == 200, answer.text
-    told: Body = answer.json()
-    return told
+    reported: Body = answer.json()
+    return reported
 
 
 def changed(report: Report, base: str, step: int, **rows: list[Any]) -> Body:
@@ -34,9 +34,9 @@ def changed(report: Report, base: str, step: int, **rows: list[Any]) -> Body:
 def whole(report: Report, step: int) -> Body:
     """The full report of the same."""
     sensors = report()["sensors"]
-    told = {"queue": 29.5, "battery": 49.5, "channel_gain": -91.25, "last_seen": step}
+    reported = {"queue": 29.5, "battery": 49.5, "channel_gain": -91.25, "last_seen": step}
     return report(
-        step=step, sensors=sensors | {name: [sensors[name][0], v, *sensors[name][2:]] for name, v in told.items()}
+        step=step, sensors=sensors | {name: [sensors[name][0], v, *sensors[name][2:]] for name, v in reported.items()}
     )
 
 
@@ -164,8 +164,8 @@ def test_deltas_of_a_batch(tmp_path: Path, report: Report) -> None:
         first = client.post("/decide/batch", json=batch(*fleet, step=0)).json()["decisions"]
         deltas = [{**changed(report, d["decision_id"], 1), "uav_id": d["uav_id"]} for d in first]
         swapped = [{**delta, "base": first[0]["decision_id"]} for delta in deltas]
-        told = refusal(client, batch(*swapped, step=1), "/decide/batch")
-        assert told == (409, INCOMPLETE, "uavs[1].base")
+        reported = refusal(client, batch(*swapped, step=1), "/decide/batch")
+        assert reported == (409, INCOMPLETE, "uavs[1].base")
         answers: list[Any] = []
 
         def ask() -> None:
@@ -198,8 +198,8 @@ def test_deltas_of_a_batch(tmp_path: Path, report: Report) -> None:
 def test_changes_that_are_none(edge: Edge, report: Report, rows: Body, status: int, field: str) -> None:
     client = edge()
     base = asked(client, report(uplink="delta"))["decision_id"]
-    told = refusal(client, changed(report, base, 1, **rows))
-    assert (told[0], told[2]) == (status, field)
+    reported = refusal(client, changed(report, base, 1, **rows))
+    assert (reported[0], reported[2]) == (status, field)
     asked(client, changed(report, base, 1))
 
 

@@ -32,11 +32,11 @@ def test_every_update_counts_with_its_loss(edge: Edge, report: Report) -> None:
         answer = client.post("/decide", json=report(step=step, outcome=outcome)).json()
         outcome = {"decision_id": answer["decision_id"], "cost": 2.0}
     until(lambda: numbers(client)["aicvds_learner_update_loss_count"] >= 5)
-    told = numbers(client)
-    assert told["aicvds_learner_update_loss_count"] == 5
-    assert told["aicvds_learner_update_loss_sum"] > told["aicvds_learner_loss"] > 0
+    reported = numbers(client)
+    assert reported["aicvds_learner_update_loss_count"] == 5
+    assert reported["aicvds_learner_update_loss_sum"] > reported["aicvds_learner_loss"] > 0
     last = client.get("/missions/test").json()["learner_loss"]
-    assert told["aicvds_learner_loss"] == pytest.approx(last)
+    assert reported["aicvds_learner_loss"] == pytest.approx(last)
 
 
 def test_full_queues_are_a_risk_and_empty_ones_are_none(edge: Edge, report: Report) -> None:
@@ -59,9 +59,9 @@ def test_the_version_is_that_of_the_package(edge: Edge) -> None:
 
 
 def test_without_an_llm_no_breaker_is_open(edge: Edge) -> None:
-    told = numbers(edge())
-    assert told["aicvds_llm_breaker_open"] == 0
-    by_status = {series: n for series, n in told.items() if series.startswith("aicvds_llm_servers")}
+    reported = numbers(edge())
+    assert reported["aicvds_llm_breaker_open"] == 0
+    by_status = {series: n for series, n in reported.items() if series.startswith("aicvds_llm_servers")}
     assert by_status == {
         f'aicvds_llm_servers{{status="{status}"}}': float(status == "off")
         for status in ("loading", "ready", "degraded", "unavailable", "off")

@@ -97,7 +97,7 @@ def collecting() -> Iterator[tuple[str, list[Span]]]:
         thread.join()
 
 
-def told(span: Span) -> dict[str, Any]:
+def reported(span: Span) -> dict[str, Any]:
     return {a.key: getattr(a.value, a.value.WhichOneof("value") or "string_value") for a in span.attributes}
 
 
@@ -126,12 +126,12 @@ def test_a_decision_is_a_trace_under_its_callers(report: Report) -> None:
     assert any("refused a request" in line and headers["traceparent"] in line for line in logged.splitlines())
     whole = next(span for span in spans if span.name == "decide")
     assert (whole.trace_id.hex(), whole.parent_span_id.hex()) == (trace, parent)
-    assert told(whole)["aicvds.decision_id"] == answer["decision_id"]
+    assert reported(whole)["aicvds.decision_id"] == answer["decision_id"]
     inside = {span.name: span for span in spans if span.parent_span_id == whole.span_id}
     assert {"augment", "attend", "prompt", "check", "store", "chat stub-1"} <= inside.keys()
     asked = inside["chat stub-1"]
     assert asked.kind == Span.SPAN_KIND_CLIENT
-    about = told(asked)
+    about = reported(asked)
     assert about["gen_ai.operation.name"] == "chat"
     assert about["gen_ai.request.model"] == "stub-1"
     assert about["server.address"] == "127.0.0.1"
@@ -155,7 +155,7 @@ def test_an_llm_that_fails_is_an_error_in_the_trace(report: Report) -> None:
         process.terminate()
         process.communicate(timeout=PATIENCE_S)
     asked = next(span for span in spans if span.name.startswith("chat"))
-    assert told(asked)["error.type"] == "llm_status"
+    assert reported(asked)["error.type"] == "llm_status"
     assert asked.status.code == 2
 
 

@@ -118,7 +118,7 @@ def test_nobody_waits_for_an_edge_that_ends() -> None:
 
 def test_nothing_slow_is_imported_before_the_first_answer() -> None:
     slow = ("torch", "numpy", "scipy", "fastapi", "sqlalchemy", "alembic", "ortools", "tiktoken", "xllamacpp")
-    told = subprocess.run(
+    reported = subprocess.run(
         [
             sys.executable,
             "-c",
@@ -131,4 +131,4 @@ def test_nothing_slow_is_imported_before_the_first_answer() -> None:
         timeout=120,
         check=True,
     )
-    assert told.stdout.strip() == "[]"
+    assert reported.stdout.strip() == "[]"

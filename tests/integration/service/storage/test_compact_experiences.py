@@ -24,7 +24,7 @@ def test_a_restart_keeps_the_block_and_the_prompts_go_on_with_it(tmp_path: Path,
         with running(tmp_path / "m.db", **settings) as (client, engine):
             wait_for(client, "ready")
             assert client.put("/missions/test", json=EIGHT).status_code == 200
-            owed = fly(client, report, range(4))
+            pending = fly(client, report, range(4))
             block = list(engine.missions.loaded[0].experiences.block)
             copy_of(tmp_path / "m.db", tmp_path / "copy.db")
         assert 4 <= len(block) <= 8
@@ -33,7 +33,7 @@ def test_a_restart_keeps_the_block_and_the_prompts_go_on_with_it(tmp_path: Path,
             wait_for(client, "ready")
             assert client.get("/missions/test").status_code == 200
             assert engine.missions.loaded[0].experiences.block == block
-            fly(client, report, range(4, 5), owed)
+            fly(client, report, range(4, 5), pending)
             asked = [body["messages"][-1]["content"] for body in model.bodies[-3:]]
             assert all(re.match(r"(?:\d\D\d[XY]){4,8}\d{6}U", text) for text in asked), asked
 
@@ -41,10 +41,10 @@ def test_a_restart_keeps_the_block_and_the_prompts_go_on_with_it(tmp_path: Path,
 def test_between_compactions_a_prompt_begins_with_the_one_before(tmp_path: Path, report: Report) -> None:
     with running(tmp_path / "m.db", **ADAPTED, llm_url="http://127.0.0.1:9/v1") as (client, engine):
         assert client.put("/missions/test", json=EIGHT).status_code == 200
-        owed: dict[int, Any] = {}
+        pending: dict[int, Any] = {}
         seen = [("", 0)]
         for step in range(12):
-            owed = fly(client, report, range(step, step + 1), owed)
+            pending = fly(client, report, range(step, step + 1), pending)
             memory = engine.missions.loaded[0].experiences
             seen.append(("".join(memory.block), memory.compactions))
     assert seen[-1][1] >= 3

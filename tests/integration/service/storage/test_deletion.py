@@ -42,11 +42,11 @@ def test_what_still_happens_to_a_deleted_mission_is_not_the_next_ones(tmp_path: 
         until(lambda: gate.callers)
         assert client.delete("/missions/test").status_code == 204
         assert client.put("/missions/test", json={"mode": "policy"}).status_code == 200
-        told = client.post("/decide", json=report()).json()
+        reported = client.post("/decide", json=report()).json()
         gate.open()
         assert late.result().status_code == 200
-        fed = client.post("/feedback", json={"mission_id": "test", "decision_id": told["decision_id"], "cost": 0.5})
-        assert (fed.status_code, told["stored"]) == (200, True)
+        fed = client.post("/feedback", json={"mission_id": "test", "decision_id": reported["decision_id"], "cost": 0.5})
+        assert (fed.status_code, reported["stored"]) == (200, True)
         copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
     with running(copied) as (client, _):
         status = client.get("/missions/test").json()

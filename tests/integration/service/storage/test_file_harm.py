@@ -200,7 +200,7 @@ def test_a_busy_store_knows_its_file_too(
 def test_a_commit_that_the_disk_refuses_is_written_later(tmp_path: Path, report: Report) -> None:
     path = tmp_path / "m.db"
     with running(path) as (client, _):
-        owed = fly(client, report, range(1))
+        pending = fly(client, report, range(1))
         (writer,) = writers(os.getpid())
         # As on a full disk, or on a file system that has become read-only.
         unlimited = psutil.Process(writer.pid).rlimit(resource.RLIMIT_FSIZE)
@@ -208,9 +208,9 @@ def test_a_commit_that_the_disk_refuses_is_written_later(tmp_path: Path, report:
         assert not client.post("/decide", json=report(step=1)).json()["stored"]
         # Decisions go on, so the edge stays ready.
         assert client.get("/readyz").status_code == 200
-        assert client.post("/feedback", json={"mission_id": "test", **owed[0]}).status_code == 503
+        assert client.post("/feedback", json={"mission_id": "test", **pending[0]}).status_code == 503
         writer.rlimit(resource.RLIMIT_FSIZE, unlimited)
-        until(lambda: client.post("/feedback", json={"mission_id": "test", **owed[0]}).status_code == 200)
+        until(lambda: client.post("/feedback", json={"mission_id": "test", **pending[0]}).status_code == 200)
         assert client.post("/decide", json=report(step=2)).json()["stored"]
     with running(path) as (client, _):
         assert client.get("/missions/test").json()["decisions"] == 5

@@ -71,7 +71,7 @@ def test_what_is_on_disk_is_the_mission_with_and_without_checkpoints(
 
 def test_a_restarted_edge_flies_on(address: str, report: Report) -> None:
     with running(address) as (client, _):
-        owed = fly(client, report, range(5))
+        unreported = fly(client, report, range(5))
         # Lessons come after the answers.
         until(lambda: client.get("/missions/test").json()["learner_updates"] == 12)
         before = client.get("/missions/test").json()
@@ -79,7 +79,7 @@ def test_a_restarted_edge_flies_on(address: str, report: Report) -> None:
         assert engine.missions.loaded == []
         assert client.get("/missions/test").json() == before
         # The outcomes of decisions from before the restart are known.
-        fly(client, report, range(5, 8), owed)
+        fly(client, report, range(5, 8), unreported)
         status = client.get("/missions/test").json()
         assert (status["decisions"], status["feedback"]) == (24, 21)
 
@@ -156,16 +156,16 @@ def test_while_the_store_is_locked_decisions_go_on_and_feedback_is_refused(
 ) -> None:
     monkeypatch.setattr(group_commit, "LONGEST_PAUSE_S", 0.25)
     with running(tmp_path / "m.db") as (client, engine):
-        owed = fly(client, report, range(3))
+        unreported = fly(client, report, range(3))
         other = locked(tmp_path / "m.db")
         try:
-            first = client.post("/decide", json=report(step=3, outcome=owed[0]))
+            first = client.post("/decide", json=report(step=3, outcome=unreported[0]))
             assert (first.status_code, first.json()["stored"]) == (200, False)
             # No answer waits for a store that is known to fail: each wait would take two minutes here.
             for step in range(4, 40):
                 answer = client.post("/decide", json=report(step=step))
                 assert (answer.status_code, answer.json()["stored"]) == (200, False)
-            refused = client.post("/feedback", json={"mission_id": "test", **owed[1]})
+            refused = client.post("/feedback", json={"mission_id": "test", **unreported[1]})
             assert (refused.status_code, refused.headers["retry-after"]) == (503, "1")
             assert client.get("/healthz").status_code == 200
             assert "aicvds_store_failures_total 0.0" not in client.get("/metrics").text
@@ -174,9 +174,9 @@ def test_while_the_store_is_locked_decisions_go_on_and_feedback_is_refused(
             other.close()
         until(lambda: not engine.journal.failing)
         # What was told with a decision has been written meanwhile; what was refused was not applied.
-        first_again = client.post("/feedback", json={"mission_id": "test", **owed[0]})
+        first_again = client.post("/feedback", json={"mission_id": "test", **unreported[0]})
         assert (first_again.status_code, first_again.json()["result"]) == (200, "duplicate")
-        again = client.post("/feedback", json={"mission_id": "test", **owed[1]})
+        again = client.post("/feedback", json={"mission_id": "test", **unreported[1]})
         assert (again.status_code, again.json()["result"]) == (200, "applied")
         assert client.post("/decide", json=report(step=41)).json()["stored"] is True
         before = client.get("/missions/test").json()
@@ -238,19 +238,19 @@ def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, report: Report) 
     assert process.stderr is not None
     try:
         url = process.stderr.readline().split()[4].rstrip(",")
-        acknowledged, refused, owed = [], 0, None
+        acknowledged, refused, unreported = [], 0, None
         with httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
             for step in range(120):
                 answer = client.post("/decide", json=report(step=step))
                 assert answer.status_code == 200, answer.text
-                if owed is not None:
-                    told = client.post("/feedback", json={"mission_id": "test", **owed})
-                    assert told.status_code in (200, 503)
-                    if told.status_code == 200:
-                        acknowledged.append(owed["decision_id"])
+                if unreported is not None:
+                    reported = client.post("/feedback", json={"mission_id": "test", **unreported})
+                    assert reported.status_code in (200, 503)
+                    if reported.status_code == 200:
+                        acknowledged.append(unreported["decision_id"])
                     else:
                         refused += 1
-                owed = {"decision_id": answer.json()["decision_id"], "cost": 0.5}
+                unreported = {"decision_id": answer.json()["decision_id"], "cost": 0.5}
         assert acknowledged
         assert refused > 10
     finally:

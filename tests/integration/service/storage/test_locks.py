@@ -56,9 +56,9 @@ def test_an_edge_ends_though_postgresql_waits_for_a_lock(postgres: str, report: 
     ):
         stored_decision(client, report())
         with _locking(postgres, "journal"):
-            told = client.post("/decide", json=report(step=1)).json()
-            assert not told["stored"]
-            outcome = {"mission_id": "test", "decision_id": told["decision_id"], "cost": 1.0}
+            reported = client.post("/decide", json=report(step=1)).json()
+            assert not reported["stored"]
+            outcome = {"mission_id": "test", "decision_id": reported["decision_id"], "cost": 1.0}
             assert client.post("/feedback", json=outcome).status_code == 503
             process.terminate()
             assert process.wait(PATIENCE_S) == 0

@@ -249,15 +249,17 @@ def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
     monkeypatch.setattr(feedback, "MAX_TASKS", 2)
     monkeypatch.setattr(feedback, "WARNING_S", 3600.0)
     with running(tmp_path / "m.db") as (client, engine):
-        owed: dict[int, str] = {}
+        unreported: dict[int, str] = {}
         for step in range(6):
             uavs = []
             for uav_id in range(3):
-                told = {"outcome": {"decision_id": owed[uav_id], "cost": 0.1 * uav_id}} if owed else {}
-                uavs.append({k: v for k, v in report(uav_id=uav_id).items() if k not in ("mission_id", "step")} | told)
+                reported = {"outcome": {"decision_id": unreported[uav_id], "cost": 0.1 * uav_id}} if unreported else {}
+                uavs.append(
+                    {k: v for k, v in report(uav_id=uav_id).items() if k not in ("mission_id", "step")} | reported
+                )
             answer = client.post("/decide/batch", json={"mission_id": "test", "step": step, "uavs": uavs})
             assert answer.status_code == 200, answer.text
-            owed = {decision["uav_id"]: decision["decision_id"] for decision in answer.json()["decisions"]}
+            unreported = {decision["uav_id"]: decision["decision_id"] for decision in answer.json()["decisions"]}
         mission = engine.missions.loaded[0]
         assert wait_for_updates(engine, mission, 10).feedback == 15
         # Not a line for each.

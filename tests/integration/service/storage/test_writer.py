@@ -43,14 +43,14 @@ def test_a_writer_that_is_killed_is_followed_by_another_and_nothing_is_lost(
     tmp_path: Path, report: Report, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with running(tmp_path / "m.db") as (client, engine):
-        owed = fly(client, report, range(2))
+        pending = fly(client, report, range(2))
         (first,) = writers(os.getpid())
         # What it was sent it has not written.
         first.suspend()
         with monkeypatch.context() as impatient:
             impatient.setattr("service.edge.engine.STORE_S", 0.1)
-            told = client.post("/decide", json=report(step=2, outcome=owed[0]))
-        assert (told.status_code, told.json()["stored"]) == (200, False)
+            reported = client.post("/decide", json=report(step=2, outcome=pending[0]))
+        assert (reported.status_code, reported.json()["stored"]) == (200, False)
         # Nor does an answer wait past its UAV's deadline.
         late = client.post("/decide", json=report(step=2, uav_id=1, deadline_ms=100))
         assert (late.status_code, late.json()["stored"]) == (200, False)
@@ -58,13 +58,13 @@ def test_a_writer_that_is_killed_is_followed_by_another_and_nothing_is_lost(
         # Nobody is told: another process writes what this one was to write.
         assert client.post("/decide", json=report(step=3)).json()["stored"]
         assert not engine.journal.failing
-        again = client.post("/feedback", json={"mission_id": "test", **owed[0]})
+        again = client.post("/feedback", json={"mission_id": "test", **pending[0]})
         assert (again.status_code, again.json()["result"]) == (200, "duplicate")
         assert "has ended (exit code -9)" in caplog.text
         # One that has nothing to do is missed only when there is something.
         (second,) = writers(os.getpid())
         second.kill()
-        fly(client, report, range(50, 53), {1: owed[1]})
+        fly(client, report, range(50, 53), {1: pending[1]})
         before = client.get("/missions/test").json()
     assert writers(os.getpid()) == []
     assert "the store fails" not in caplog.text

@@ -21,10 +21,10 @@ class Told(StubVehicle):
 
     def __init__(self, site: Site) -> None:
         super().__init__(site, 0, SimulatedClock())
-        self.told: dict[str, Any] = {}
+        self.reported: dict[str, Any] = {}
 
     async def state(self) -> VehicleState:
-        return replace(await super().state(), **self.told)
+        return replace(await super().state(), **self.reported)
 
 
 def told_uav(height_m: float = 50.0) -> tuple[FieldUav, Told]:
@@ -33,10 +33,10 @@ def told_uav(height_m: float = 50.0) -> tuple[FieldUav, Told]:
     return FieldUav(0, vehicle, site, height_m), vehicle
 
 
-async def reasons(uav: FieldUav, vehicle: Told, *told: dict[str, Any]) -> list[str | None]:
+async def reasons(uav: FieldUav, vehicle: Told, *reported: dict[str, Any]) -> list[str | None]:
     """Why it gets no command after each of these reports."""
     found = []
-    for vehicle.told in told:
+    for vehicle.reported in reported:
         await uav.update(1.0)
         found.append(uav.unavailable_reason)
     return found
@@ -70,7 +70,7 @@ async def test_an_airframe_that_still_grows_faster_has_not_reached_its_top_speed
     await uav.command(14)
     seen = []
     for speed in (7.0, 7.0, 9.0, 9.0, 9.0):
-        vehicle.told = {"speed_m_s": speed}
+        vehicle.reported = {"speed_m_s": speed}
         await uav.update(2.0)
         seen.append(uav.top_speed_m_s)
     assert seen == [None, None, None, None, 9.0]

@@ -19,9 +19,9 @@ def completion(text: str, **first_token: float) -> Completion:
 def test_calibration_takes_a_favourite_label_away() -> None:
     """An LLM that says A whatever is asked, and prefers B a little where B is better."""
     bias = {"A": 0.9, "B": 0.05, "C": 0.05}
-    told = {"A": 0.85, "B": 0.11, "C": 0.04}
-    assert max(told, key=lambda label: told[label]) == "A"
-    corrected = calibrated(told, bias)
+    reported = {"A": 0.85, "B": 0.11, "C": 0.04}
+    assert max(reported, key=lambda label: reported[label]) == "A"
+    corrected = calibrated(reported, bias)
     assert max(corrected, key=lambda label: corrected[label]) == "B"
     assert sum(corrected.values()) == pytest.approx(1.0)
     # What says no more than the bias says nothing.
@@ -34,27 +34,27 @@ def test_a_label_that_is_hardly_ever_drawn_gets_no_more_than_tenfold_its_uniform
 
 
 def test_sharpened_probabilities_are_nearer_to_a_choice() -> None:
-    told = {"A": 0.5, "B": 0.25, "C": 0.25}
-    assert raised(told, 1.0) == pytest.approx(told)
-    assert raised(told, 4.0) == pytest.approx({"A": 16 / 18, "B": 1 / 18, "C": 1 / 18})
+    reported = {"A": 0.5, "B": 0.25, "C": 0.25}
+    assert raised(reported, 1.0) == pytest.approx(reported)
+    assert raised(reported, 4.0) == pytest.approx({"A": 16 / 18, "B": 1 / 18, "C": 1 / 18})
     assert raised({"A": 1e-12, "B": 1e-300}, 4.0) == pytest.approx({"A": 1.0, "B": 0.0})
 
 
 def test_probabilities_come_from_the_tokens_told_or_else_from_the_answer() -> None:
-    def told(made: Completion, labels: str) -> dict[str, float]:
+    def reported(made: Completion, labels: str) -> dict[str, float]:
         return probabilities(made, [labels])[0]
 
-    assert told(completion("x", A=0.6, B=0.2, the=0.2), "AB") == pytest.approx({"A": 0.75, "B": 0.25})
+    assert reported(completion("x", A=0.6, B=0.2, the=0.2), "AB") == pytest.approx({"A": 0.75, "B": 0.25})
     # C was not among the likeliest tokens.
-    assert told(completion("A", A=0.6, B=0.2), "ABC")["C"] == pytest.approx(0.1 / 0.9)
-    assert told(completion(" B\n"), "AB") == pytest.approx({"A": 0.025, "B": 0.975})
+    assert reported(completion("A", A=0.6, B=0.2), "ABC")["C"] == pytest.approx(0.1 / 0.9)
+    assert reported(completion(" B\n"), "AB") == pytest.approx({"A": 0.025, "B": 0.975})
     with pytest.raises(NoDecision):
-        told(completion("hello", the=1.0), "AB")
+        reported(completion("hello", the=1.0), "AB")
 
 
 def test_several_lists_are_read_place_by_place_or_line_by_line() -> None:
     likeliest = {"A": 0.9, "B": 0.1}, {"\n": 1.0}, {"C": 0.5, "B": 0.2, "A": 0.3}
-    places = tuple(TokenPosition(token, told) for token, told in zip(("A", "\n", "B"), likeliest, strict=True))
+    places = tuple(TokenPosition(token, reported) for token, reported in zip(("A", "\n", "B"), likeliest, strict=True))
     read = probabilities(Completion("A\nB", None, None, None, places), ["AB", "AB"])
     assert read == [pytest.approx({"A": 0.9, "B": 0.1}), pytest.approx({"A": 0.6, "B": 0.4})]
     # Of the second label no probabilities came: then the text counts, for both.
@@ -67,10 +67,10 @@ def test_several_lists_are_read_place_by_place_or_line_by_line() -> None:
 
 def test_a_single_label_is_read_where_it_should_stand_though_something_else_was_drawn() -> None:
     """ServerPool that cannot be held to the labels begin with a line's end, say."""
-    (told,) = probabilities(
+    (reported,) = probabilities(
         Completion("\n", None, None, None, (TokenPosition("\n", {"": 0.6, "A": 0.3, "B": 0.1}),)), ["AB"]
     )
-    assert told == pytest.approx({"A": 0.75, "B": 0.25})
+    assert reported == pytest.approx({"A": 0.75, "B": 0.25})
 
 
 def test_a_certain_answer_leaves_no_label_without_a_bias() -> None:

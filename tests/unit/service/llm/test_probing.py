@@ -45,9 +45,9 @@ class Told:
 
 @pytest.mark.parametrize(("enough_s", "times"), [(1e9, 1), (0.0, 2)])
 async def test_a_first_decision_that_takes_long_is_timed_again(enough_s: float, times: int) -> None:
-    told = Told(lambda _: "A", [])
-    answer, seconds = await first_decision(told.client, "model", LABELS, Abilities(), enough_s)
-    assert (answer.text, len(told.bodies)) == ("A", times)
+    reported = Told(lambda _: "A", [])
+    answer, seconds = await first_decision(reported.client, "model", LABELS, Abilities(), enough_s)
+    assert (answer.text, len(reported.bodies)) == ("A", times)
     assert seconds >= 0.0
 
 
@@ -76,24 +76,24 @@ async def test_the_model_is_the_first_listed_one_that_may_chat_also_once_it_is_l
 
 
 async def test_a_given_model_is_not_looked_for() -> None:
-    told = Told(lambda _: "hello", ["first"])
-    assert (await probe(told.client, "given")).model == "given"
-    assert {body["model"] for body in told.bodies} == {"given"}
+    reported = Told(lambda _: "hello", ["first"])
+    assert (await probe(reported.client, "given")).model == "given"
+    assert {body["model"] for body in reported.bodies} == {"given"}
 
 
 async def test_a_server_that_asks_for_a_long_pause_is_not_ready() -> None:
     busy = Busy("HTTP 503", time.monotonic() + 12.0)
-    told = Told(lambda _: "hello" if len(told.bodies) > 1 else busy, ["first"])
+    reported = Told(lambda _: "hello" if len(reported.bodies) > 1 else busy, ["first"])
     with pytest.raises(Busy):
-        await probe(told.client, None)
-    assert len(told.bodies) == 1
+        await probe(reported.client, None)
+    assert len(reported.bodies) == 1
 
 
 async def test_a_server_that_is_gone_is_no_server_without_abilities() -> None:
-    told = Told(lambda _: Unreachable("llm_error", "refused"), ["first"])
+    reported = Told(lambda _: Unreachable("llm_error", "refused"), ["first"])
     with pytest.raises(Unreachable):
-        await probe(told.client, "model")
-    assert len(told.bodies) == 1
+        await probe(reported.client, "model")
+    assert len(reported.bodies) == 1
 
 
 async def test_a_server_that_refuses_plain_requests_too_is_no_server() -> None:

@@ -5,15 +5,15 @@ from service.mission.decisions import AppliedOutcomes, Reservation, Reservations
 
 def test_what_was_applied_is_known_with_its_sign_and_its_zero() -> None:
     applied = AppliedOutcomes(most=3)
-    told = [
+    reported = [
         ("0" * 31 + str(n), cost, failed) for n, (cost, failed) in enumerate([(0.0, True), (0.0, False), (2.5, True)])
     ]
-    for one in told:
+    for one in reported:
         applied.add(*one)
-    assert [applied[name] for name, *_ in told] == [(cost, failed) for _, cost, failed in told]
+    assert [applied[name] for name, *_ in reported] == [(cost, failed) for _, cost, failed in reported]
     again = AppliedOutcomes(most=3)
     again.load_state_dict(applied.state_dict())
-    assert again.state_dict() == told
+    assert again.state_dict() == reported
 
 
 def test_a_cost_of_minus_zero_is_no_failure() -> None:

@@ -151,9 +151,9 @@ def test_no_experiences_means_no_block_and_no_word_of_it() -> None:
     assert "Past experiences" not in prompts[0].static
 
 
-@pytest.mark.parametrize(("told", "kept"), [(None, 30), (6, 6), (100, 100)])
-def test_a_mission_says_how_many_experiences_it_keeps(told: int | None, kept: int) -> None:
-    spec = MissionSpec(mode="llm", prompt=PromptStyle(format="csv", experiences=told))
+@pytest.mark.parametrize(("reported", "kept"), [(None, 30), (6, 6), (100, 100)])
+def test_a_mission_says_how_many_experiences_it_keeps(reported: int | None, kept: int) -> None:
+    spec = MissionSpec(mode="llm", prompt=PromptStyle(format="csv", experiences=reported))
     prompts = flown(105, spec, llm_context=8192)
     assert max(len(p.experiences.splitlines()) for p in prompts) == kept
     status = status_of(mission(spec, llm_context=8192))

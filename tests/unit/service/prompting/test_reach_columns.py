@@ -18,12 +18,12 @@ PATH = trajectories(PAPER)[0]
 REACH = MissionSpec(features="reach")
 
 
-def on_lap(places: list[Point], queue: list[float | None], *, step: int = 0, told: bool = True) -> UavState:
+def on_lap(places: list[Point], queue: list[float | None], *, step: int = 0, reported: bool = True) -> UavState:
     """UAV 0 at the beginning of its lap, and sensors at these places."""
     x, y = PATH.at(0.0).tolist()
     state = uav(step=step, position=(x, y), x=[place[0] for place in places], queue=queue)
     sensors = state.sensors.model_copy(update={"y": [place[1] for place in places]})
-    return state.model_copy(update={"sensors": sensors, "progress_m": 0.0 if told else None})
+    return state.model_copy(update={"sensors": sensors, "progress_m": 0.0 if reported else None})
 
 
 def at(progress: float) -> Point:
@@ -35,9 +35,9 @@ def seen(state: UavState, spec: MissionSpec = REACH, step: int = 0) -> AttendedS
     return attended(mission(spec), state, step)
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_distances_are_those_of_the_world_after_the_step(told: bool) -> None:
-    view = seen(on_lap([at(480.0), at(-300.0)], [60.0, 60.0], told=told))
+@pytest.mark.parametrize("reported", [True, False])
+def test_distances_are_those_of_the_world_after_the_step(reported: bool) -> None:
+    view = seen(on_lap([at(480.0), at(-300.0)], [60.0, 60.0], reported=reported))
     assert view.state.reach is not None
     for velocity in range(15):
         arrived = PATH.at(velocity * PAPER.step_s)
@@ -50,7 +50,8 @@ def test_a_route_there_and_back_is_followed_the_way_that_the_uav_says() -> None:
     routed = PAPER.model_copy(update={"uavs": 1, "routes": (((0.0, 0.0), (1000.0, 0.0)),)})
     places = np.array([[1000.0, 0.0]])
     out, back = (
-        distances_between(places_ahead(0, (500.0, 0.0), told, routed), places)[14, 0] for told in (500.0, 1500.0)
+        distances_between(places_ahead(0, (500.0, 0.0), reported, routed), places)[14, 0]
+        for reported in (500.0, 1500.0)
     )
     assert (out, back) == (pytest.approx(360.0), pytest.approx(640.0))
 
@@ -122,13 +123,13 @@ def test_a_sensor_that_nothing_arrives_at_never_overflows() -> None:
 
 def test_the_velocity_scorer_is_told_what_each_level_brings() -> None:
     state = seen(on_lap([at(-300.0), at(480.0)], [60.0, 45.0])).state
-    told = state.approaches([1], PAPER)[0]
-    assert told.shape == (15, LEVEL_FEATURES)
+    reported = state.approaches([1], PAPER)[0]
+    assert reported.shape == (15, LEVEL_FEATURES)
     assert state.reach is not None
-    np.testing.assert_allclose(told[:, 0], state.reach.packets[:, 1] / 60, rtol=1e-6)
-    np.testing.assert_allclose(told[:, 1], state.urgency[1] * state.reach.packets[:, 1] / 60, rtol=1e-6)
-    np.testing.assert_allclose(told[:, 2], np.arange(15) / 14, rtol=1e-6)
-    np.testing.assert_allclose(told[:, 3], np.minimum(state.reach.links.distance[:, 1] / 360, 2), rtol=1e-6)
+    np.testing.assert_allclose(reported[:, 0], state.reach.packets[:, 1] / 60, rtol=1e-6)
+    np.testing.assert_allclose(reported[:, 1], state.urgency[1] * state.reach.packets[:, 1] / 60, rtol=1e-6)
+    np.testing.assert_allclose(reported[:, 2], np.arange(15) / 14, rtol=1e-6)
+    np.testing.assert_allclose(reported[:, 3], np.minimum(state.reach.links.distance[:, 1] / 360, 2), rtol=1e-6)
 
 
 def test_the_shipped_start_slows_down_for_a_full_queue_and_hurries_past_an_empty_one() -> None:

@@ -14,7 +14,7 @@ ALL = np.arange(10)
 ONE_STEP = np.ones(10, dtype=np.int64)
 
 
-def told(came: IntArray) -> Arrivals:
+def reported(came: IntArray) -> Arrivals:
     """The arrivals after beacons in every step; ``came``, ``(T, 10)``, packets."""
     arrivals = Arrivals(WORLD)
     for step, row in enumerate(came):
@@ -33,14 +33,14 @@ def bursts(steps: int = 200) -> IntArray:
 
 @pytest.mark.parametrize("steps", [0, 1, 5, 20, 200])
 def test_poissons_arrivals_have_no_bursts_to_the_bit(steps: int) -> None:
-    arrivals = told(poisson(steps))
+    arrivals = reported(poisson(steps))
     assert arrivals.dispersion == 1.0
     assert not arrivals.burst(steps).any()
     np.testing.assert_array_equal(arrivals.coming(steps, 8.0, ALL), arrivals.rate)
 
 
 def test_bursts_are_seen_and_go_on_for_a_while() -> None:
-    in_burst, after = told(bursts(196)), told(bursts(216))
+    in_burst, after = reported(bursts(196)), reported(bursts(216))
     assert in_burst.dispersion > 2.0
     soon = in_burst.burst(196)
     assert (soon > 3.0).all()
@@ -59,8 +59,8 @@ def test_a_bursts_packets_come_in_the_next_steps_and_no_more_than_all_of_them() 
 
 @pytest.mark.parametrize("came", [poisson(), bursts()])
 def test_a_restored_state_goes_on_to_the_bit(came: IntArray) -> None:
-    whole, again = told(came), Arrivals(WORLD)
-    again.load_state_dict(told(came[:100]).state_dict())
+    whole, again = reported(came), Arrivals(WORLD)
+    again.load_state_dict(reported(came[:100]).state_dict())
     for step, row in enumerate(came[100:], 100):
         again.take(ALL, row.astype(np.float64), ONE_STEP, ONE_STEP * (step + 1))
     assert again.dispersion == whole.dispersion

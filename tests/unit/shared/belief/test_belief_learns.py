@@ -25,21 +25,21 @@ def start(fleet: FleetBelief, uav: int = 0, progress_m: float = 0.0) -> tuple[fl
 
 def report(fleet: FleetBelief, step: int, uav: int = 0, *, queue: float = 50.0, **changes: Any) -> None:
     """A UAV that hovers at the beginning of its lap, hears the sensors, and measures the formula's gains."""
-    told = {"battery": 40.0, "excess_db": np.zeros(3), "heard": IDS, **changes}
+    reported = {"battery": 40.0, "excess_db": np.zeros(3), "heard": IDS, **changes}
     here = start(fleet)
     fleet.advance(step)
     fleet.locate(uav, step, here, 0.0 if uav == 0 else None)
     places = np.array([(here[0] + off, here[1]) for off in OFF])
-    heard = told["heard"]
+    heard = reported["heard"]
     beacons = np.full(len(heard), step)
-    fleet.hear(heard, places[heard], beacons, np.full(len(heard), queue), np.full(len(heard), told["battery"]))
-    fleet.measure(uav, heard, (channel_gain_db(OFF, WORLD) - told["excess_db"])[heard])
+    fleet.hear(heard, places[heard], beacons, np.full(len(heard), queue), np.full(len(heard), reported["battery"]))
+    fleet.measure(uav, heard, (channel_gain_db(OFF, WORLD) - reported["excess_db"])[heard])
 
 
-def visited(sensor: int = 0, **told: Any) -> FleetBelief:
+def visited(sensor: int = 0, **reported: Any) -> FleetBelief:
     """A fleet whose UAV 0 is told in step 0 to visit a sensor, hovering."""
     fleet = FleetBelief(WORLD)
-    report(fleet, 0, **told)
+    report(fleet, 0, **reported)
     fleet.record_decision(0, 0, sensor, 0)
     return fleet
 
@@ -150,12 +150,12 @@ def flown(
     fleet, progress = FleetBelief(WORLD), 1700.0
     length = fleet.trajectory(0).length_m
     for step in range(steps):
-        told = math.fmod(progress, length) if wraps else progress
+        reported = math.fmod(progress, length) if wraps else progress
         if failed is not None:
             fleet.settle(0, step - 1, failed)
         fleet.advance(step)
         for _ in range(again):
-            fleet.locate(0, step, start(fleet, 0, progress), told)
+            fleet.locate(0, step, start(fleet, 0, progress), reported)
             fleet.measure(0, IDS[:0], np.array([]))
         fleet.record_decision(0, step, 0, 14)
         progress += 140.0 * share
@@ -181,15 +181,15 @@ def test_a_decision_without_an_outcome_teaches_no_wind() -> None:
 # ---- what a failure says of the radio
 
 
-def fails(times: int, **told: Any) -> FleetBelief:
+def fails(times: int, **reported: Any) -> FleetBelief:
     """A fleet whose UAV 0 fails to collect from sensor 0 in so many steps, and hears its beacons."""
-    told = {"failed": True, "sensor": 0, "queue": 20.0, **told}
-    failed, sensor = told.pop("failed"), told.pop("sensor")
+    reported = {"failed": True, "sensor": 0, "queue": 20.0, **reported}
+    failed, sensor = reported.pop("failed"), reported.pop("sensor")
     fleet = FleetBelief(WORLD)
     for step in range(times + 1):
         if failed is not None and step:
             fleet.settle(0, step - 1, failed)
-        report(fleet, step, **told)
+        report(fleet, step, **reported)
         fleet.record_decision(0, step, sensor, 0)
     return fleet
 
@@ -200,7 +200,7 @@ def test_two_failures_over_a_good_link_are_a_dead_radio() -> None:
 
 
 @pytest.mark.parametrize(
-    "told",
+    "reported",
     [
         {"failed": False},
         {"failed": None},
@@ -212,18 +212,18 @@ def test_two_failures_over_a_good_link_are_a_dead_radio() -> None:
     ],
     ids=["it succeeds", "the outcome is unknown", "battery flat", "battery below a packet", "weak", "far", "unheard"],
 )
-def test_no_radio_is_dead_where_something_else_explains_the_failures(told: dict[str, Any]) -> None:
-    assert fails(6, **told).channel.failures.none
+def test_no_radio_is_dead_where_something_else_explains_the_failures(reported: dict[str, Any]) -> None:
+    assert fails(6, **reported).channel.failures.none
 
 
 def test_a_failure_some_steps_ago_says_nothing_of_the_link_that_is_measured_now() -> None:
-    told = {}
+    reported = {}
     for step in (1, 2):
         fleet = visited()
         fleet.settle(0, 0, failed=True)
         report(fleet, step)
-        told[step] = not fleet.channel.failures.none
-    assert told == {1: True, 2: False}
+        reported[step] = not fleet.channel.failures.none
+    assert reported == {1: True, 2: False}
 
 
 def test_a_report_that_comes_again_teaches_nothing() -> None:

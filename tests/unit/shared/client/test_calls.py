@@ -46,8 +46,8 @@ def test_the_last_sensor_and_the_highest_velocity_are_the_worlds_and_the_next_on
 
 
 def test_a_round_trip_is_told_to_a_microsecond_and_at_most_the_wires_longest() -> None:
-    told = [exchange(rtt_ms).outcome(0.5, False).round_trip_ms for rtt_ms in (12.34567, 2 * MAX_ROUND_TRIP_MS)]
-    assert told == [12.346, MAX_ROUND_TRIP_MS]
+    reported = [exchange(rtt_ms).outcome(0.5, False).round_trip_ms for rtt_ms in (12.34567, 2 * MAX_ROUND_TRIP_MS)]
+    assert reported == [12.346, MAX_ROUND_TRIP_MS]
 
 
 @pytest.mark.parametrize("of", [{"step": 4}, {"uav_id": 0}])

@@ -136,9 +136,9 @@ def test_with_no_time_at_all_there_is_still_a_plan_and_a_bound() -> None:
 def test_a_greedy_plan_keeps_what_is_fixed_and_leaves_it_and_what_is_barred_alone() -> None:
     usable = np.ones((4, 3), dtype=np.bool_)
     usable[1, 2] = False
-    told = {0: np.array([[1, 2], [0, 1]])}
-    actions = look_ahead(changed(tiny(4, horizon=4, radio_radius_m=900.0), fixed=told, usable=usable))
-    np.testing.assert_array_equal(actions[:2, 0], told[0])
+    reported = {0: np.array([[1, 2], [0, 1]])}
+    actions = look_ahead(changed(tiny(4, horizon=4, radio_radius_m=900.0), fixed=reported, usable=usable))
+    np.testing.assert_array_equal(actions[:2, 0], reported[0])
     assert actions[0, 1, 0] != 1
     assert actions[1, 1, 0] == 1
     assert all(len(set(step)) == 2 for step in actions[:, :, 0].tolist())

@@ -116,14 +116,14 @@ def test_a_field_out_of_form_is_named(change: dict[str, Any], field: str) -> Non
 
 
 def test_what_need_not_be_told_is_left_out() -> None:
-    told = columns()
-    del told["x"], told["y"]
-    request = DecideRequest.model_validate_json(json.dumps(body(sensors=told, base=DECISION)))
+    reported = columns()
+    del reported["x"], reported["y"]
+    request = DecideRequest.model_validate_json(json.dumps(body(sensors=reported, base=DECISION)))
     again = request.model_dump_json()
     assert DecideRequest.model_validate_json(again) == request and '"x"' not in again
     assert not {"base", "uplink"} & DecideRequest.model_validate(body()).model_dump().keys()
     assert "column y has 0 entries, column id has 3" in refusal(body(sensors=columns(y=[])))
-    nobody: dict[str, Any] = {key: [] for key in told}
+    nobody: dict[str, Any] = {key: [] for key in reported}
     assert "column id has no entries" in refusal(body(sensors=nobody))
     assert DecideRequest.model_validate_json(json.dumps(body(sensors=nobody, base=DECISION))).sensors.id == []
 

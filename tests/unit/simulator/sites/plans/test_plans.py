@@ -356,8 +356,8 @@ def test_the_commands_say_what_they_wrote_and_what_is_missing(
 ) -> None:
     path = write(tmp_path / "a.plan", plan(*TRIANGLE, AGAIN))
     assert world.main(["import", str(path), "--out", str(tmp_path / "w")]) == 0
-    told = capsys.readouterr().out
-    assert "1 trajectories, 0 fences, 0 sensors" in told and "Add the sensors" in told and "at 60 m" in told
+    reported = capsys.readouterr().out
+    assert "1 trajectories, 0 fences, 0 sensors" in reported and "Add the sensors" in reported and "at 60 m" in reported
     assert world.main(["export", str(EXAMPLE), "--plan", str(tmp_path)]) == 0
     assert json.loads((tmp_path / "uav_2.plan").read_text())["fileType"] == "Plan"
     assert world.main(["import", str(path)]) == 2
