@@ -158,8 +158,7 @@ class LlmQueries:
         if not asked:
             return {}
         prompts = template.fleet_prompts(
-            {uav: (candidates, state.state) for uav, (state, candidates) in asked.items()},
-            mission.experiences.block,
+            {uav: (candidates, state.state) for uav, (state, candidates) in asked.items()}, mission.experiences.block
         )
         static, user = template.fleet_static, "".join(prompt.user for prompt in prompts.values())
         labels = [list(candidates.labels) for _, candidates in asked.values()]

@@ -68,7 +68,7 @@ class LeasedOwnership:
         address: where clients reach this edge.
         term_s: seconds that a lease lasts without renewal.
         on_round: called on the event loop after each renewal, with the missions that other edges have taken over, and
-            with the IDs of all stored missions that no other edge owns.
+            the IDs of all stored missions that no other edge owns, and whether the database has started anew.
 
     Attributes:
         shared: whether other edges may own missions of the store.
@@ -82,7 +82,7 @@ class LeasedOwnership:
         address: str,
         term_s: float,
         metrics: Metrics,
-        on_round: Callable[[set[str], list[str]], None],
+        on_round: Callable[[set[str], list[str], bool], None],
     ) -> None:
         self._leases = leases
         self._address = address
@@ -93,6 +93,7 @@ class LeasedOwnership:
         self._renewed_at = time.monotonic()
         self._failure: str | None = None
         self._loop = asyncio.get_running_loop()
+        self._started = leases.started()
         self._ending = threading.Event()
         # A daemon: the end of the edge does not wait for a hanging database.
         threading.Thread(target=self._keep_renewing, name="leases", daemon=True).start()
@@ -168,8 +169,10 @@ class LeasedOwnership:
             # The next request for the mission of an ended lease takes it again, unless another edge has it by then.
             lease.until = asked_at + self._term_s if renewed.get(mission_id) == lease.epoch else 0.0
         ended = {(mission_id, lease.epoch) for mission_id, lease in leases.items() if not lease.until}
-        taken = {mission_id for mission_id, _ in self._leases.lost(ended)} if ended else set[str]()
-        unowned = self._leases.unowned()
+        lost = self._leases.lost(ended) if ended else set[tuple[str, int]]()
+        # A lease that a request has taken again meanwhile is not lost.
+        taken = {mission_id for mission_id, _ in lost if self._leased.get(mission_id) is leases[mission_id]}
+        unowned, before, self._started = self._leases.unowned(), self._started, self._leases.started()
         self._renewed_at = asked_at
         if self._failure is not None:
             log.warning("the leases are renewed again")
@@ -177,7 +180,7 @@ class LeasedOwnership:
         self._metrics.leases.set(len(leases) - len(ended))
         # The event loop is closed if the edge has ended meanwhile.
         with suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(self._on_round, taken, unowned)
+            self._loop.call_soon_threadsafe(self._on_round, taken, unowned, before != self._started)
 
     def _fail(self, failure: str) -> None:
         if failure != self._failure:

@@ -191,8 +191,10 @@ class StoredMissions:
             log.error("the store cannot be read: %s", cause(error))
             raise Unavailable("mission_id", "the store cannot be read; the log has the details") from None
 
-    def _reconcile(self, taken: set[str], unowned: list[str]) -> None:
+    def _reconcile(self, taken: set[str], unowned: list[str], anew: bool) -> None:
         """After a renewal: drop the missions that other edges have taken over, and list those that none owns."""
+        if anew:
+            self._journal.recovered()
         for mission_id in taken:
             self.drop(mission_id)
         self.listed = set(unowned) - self._missions.keys()

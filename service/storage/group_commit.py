@@ -40,9 +40,9 @@ class _CommitState(Enum):
     WRITING = "writing"
     # The last transaction failed. A timer begins the next one.
     PAUSING = "pausing"
-    # `close` was called while a transaction ran. One that fails is tried once more.
+    # The first transaction since `close` was called, or the one that ran then. If it fails, it is tried once more.
     DRAINING = "draining"
-    # A transaction runs that began after `close` was called. If it fails, the queue is abandoned.
+    # A later transaction runs. If it fails, the queue is abandoned.
     FINISHING = "finishing"
     # No further transaction begins.
     CLOSED = "closed"
@@ -141,7 +141,7 @@ class GroupCommit:
             case _CommitState.WRITING:
                 self._state = _CommitState.DRAINING
             case _CommitState.LINGERING | _CommitState.PAUSING:
-                self._begin(_CommitState.FINISHING)
+                self._begin(_CommitState.DRAINING)
             case _CommitState.IDLE | _CommitState.CLOSED:
                 self._end()
         try:

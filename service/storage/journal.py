@@ -211,6 +211,7 @@ class Journal:
     async def close(self, within_s: float) -> bool:
         """Write the queue once more; returns whether that has ended, so that the store may be closed."""
         ends = self._loop.time() + within_s
+        self.on_recovery = lambda: None
         if self._packed:
             await asyncio.wait(self._packed, timeout=within_s)
         self._packing.shutdown(wait=False, cancel_futures=True)
@@ -227,7 +228,8 @@ class Journal:
 
     def _take(self, mission_log: MissionLog, seq: int, packed: bytes) -> None:
         if not mission_log.ended:
-            self._commits.supersede(Checkpoint(mission_log.mission.mission_id, seq, packed, mission_log.epoch))
+            mission_id, epoch, newest = mission_log.mission.mission_id, mission_log.epoch, mission_log.seq
+            self._commits.supersede(Checkpoint(mission_id, seq, packed, epoch, newest))
 
 
 def _weight(event: Event) -> int:

@@ -55,6 +55,7 @@ _UNOWNED = sa.text("""
         WHERE leases.mission_id = missions.mission_id AND owner <> :owner AND expires_at > clock_timestamp()
     )
 """)
+_STARTED = sa.text("SELECT pg_postmaster_start_time()")
 # Fails by a division by zero unless every lease exists; the statements sent after it then have no effect.
 _FENCE = """
     SELECT 1 / (count(*) = %s)::int FROM (
@@ -66,7 +67,8 @@ _FENCE = """
 _NEWER = sa.text("""
     SELECT written.mission_id, written.epoch FROM leases
     JOIN unnest(CAST(:names AS text[]), CAST(:epochs AS bigint[])) AS written (mission_id, epoch) USING (mission_id)
-    WHERE leases.epoch > written.epoch OR leases.epoch = written.epoch AND owner <> :owner
+    WHERE leases.epoch > written.epoch
+    OR owner <> :owner AND (leases.epoch = written.epoch OR expires_at > clock_timestamp())
 """)
 _RESTORE = sa.text("""
     INSERT INTO leases AS held (mission_id, owner, address, epoch, expires_at)
@@ -74,7 +76,7 @@ _RESTORE = sa.text("""
     FROM unnest(CAST(:names AS text[]), CAST(:epochs AS bigint[])) AS known (mission_id, epoch) ORDER BY mission_id
     ON CONFLICT (mission_id) DO UPDATE
     SET owner = excluded.owner, address = '', epoch = excluded.epoch, expires_at = clock_timestamp()
-    WHERE held.epoch < excluded.epoch
+    WHERE held.epoch < excluded.epoch AND (held.owner = excluded.owner OR held.expires_at <= clock_timestamp())
 """)
 
 
@@ -140,6 +142,11 @@ class Leases:
             rows = db.execute(_RENEW, {"owner": self._owner, "term_s": term_s}).all()
         return {row.mission_id: row.epoch for row in rows}
 
+    def started(self) -> object:
+        """When the database's process began: another database, or one that was restored, has another time."""
+        with self._autocommit() as db:
+            return db.scalar(_STARTED)
+
     def release(self) -> None:
         """End every lease of this owner now; the epochs stay."""
         with self._autocommit() as db:
@@ -166,8 +173,7 @@ class Leases:
     def lost(self, missions: Collection[tuple[str, int]]) -> set[tuple[str, int]]:
         """The missions and epochs whose lease another owner has taken over.
 
-        A lease that is missing, or has a smaller epoch, was never lost: the database has gone back, as where a standby
-        lacks the last transactions. Where nothing is lost, such leases are made anew; they have ended.
+        Where a lease is missing or has a smaller epoch, the database has gone back: such leases are made anew, ended.
         """
         names, epochs = zip(*missions, strict=True)
         written = {"names": list(names), "epochs": list(epochs), "owner": self._owner}

@@ -34,12 +34,13 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """A mission's whole state after event ``seq``, packed."""
+    """A mission's whole state after event ``seq``, packed; events after ``newest`` are of an earlier mission."""
 
     mission_id: str
     seq: int
     state: bytes
     epoch: int = 0
+    newest: int = 2**62
 
 
 @dataclass(frozen=True, slots=True)

@@ -100,17 +100,14 @@ class Statements:
         self._dialect = dialect
         # "On conflict" is not generic SQL; SQLAlchemy has imported the dialect in use already.
         insert: Any = import_module(f"sqlalchemy.dialects.{dialect.name}").insert
-        put = insert(checkpoints)
-        newer = {"seq": put.excluded.seq, "state": put.excluded.state}
-        put = put.on_conflict_do_update(index_elements=["mission_id"], set_=newer)
-        of: sa.BindParameter[str] = sa.bindparam("of")
-        until: sa.BindParameter[int] = sa.bindparam("until")
-        # A mission that is there stays: it is made anew where a database may have gone back.
-        self._made = self._compiled(insert(missions).on_conflict_do_nothing(), *missions.c.keys())
-        self._entry = self._compiled(_conflict_fails(insert(journal)), *journal.c.keys())
-        self._checkpoint = self._compiled(put, *checkpoints.c.keys())
-        covered = sa.delete(journal).where((journal.c.mission_id == of) & (journal.c.seq <= until))
-        self._covered = self._compiled(covered, "of", "until")
+        parameter: Any = sa.bindparam
+        of, until, newest = parameter("of"), parameter("until"), parameter("newest")
+        # Where a database has gone back, an earlier mission of the same ID is overwritten.
+        self._made = self._compiled(_overwriting(insert(missions), 1), *missions.c.keys())
+        self._entry = self._compiled(_overwriting(insert(journal), 2), *journal.c.keys())
+        self._checkpoint = self._compiled(_overwriting(insert(checkpoints), 1), *checkpoints.c.keys())
+        covered = (journal.c.mission_id == of) & ((journal.c.seq <= until) | (journal.c.seq > newest))
+        self._covered = self._compiled(sa.delete(journal).where(covered), "of", "until", "newest")
         self._deleted = [
             self._compiled(sa.delete(table).where(table.c.mission_id == of), "of")
             for table in (missions, checkpoints, journal)
@@ -141,8 +138,8 @@ class Statements:
         match change:
             case Made(mission_id, asked_for, spec):
                 return [self._made.of_one_row(mission_id, asked_for.model_dump_json(), spec.model_dump_json())]
-            case Checkpoint(mission_id, seq, state):
-                return [self._checkpoint.of_one_row(mission_id, seq, state), self._covered.of_one_row(mission_id, seq)]
+            case Checkpoint(of, seq, state, _, newest):
+                return [self._checkpoint.of_one_row(of, seq, state), self._covered.of_one_row(of, seq, newest)]
             case Deleted(mission_id):
                 return [deleted.of_one_row(mission_id) for deleted in self._deleted]
 
@@ -152,11 +149,10 @@ class Statements:
         return _Compiled(sql, None if self._dialect.positional else names)
 
 
-def _conflict_fails(put: Any) -> Any:
-    """An insert that ignores an event that is there, and fails where its bytes differ."""
-    differ = sa.or_(journal.c.kind != put.excluded.kind, journal.c.body != put.excluded.body)
-    # The body must not be null.
-    return put.on_conflict_do_update(index_elements=["mission_id", "seq"], set_={"body": sa.null()}, where=differ)
+def _overwriting(put: Any, key: int) -> Any:
+    """An insert that overwrites a row of the same first ``key`` columns, the primary key."""
+    names = put.table.c.keys()
+    return put.on_conflict_do_update(index_elements=names[:key], set_={n: put.excluded[n] for n in names[key:]})
 
 
 def encode(event: Event) -> tuple[Kind, bytes]:

@@ -33,7 +33,7 @@ _LIMITED = "SELECT set_config(name, '3000', false) FROM pg_settings WHERE name =
 _MIGRATING = 0x41494356
 _SCHEMA_OF_FIRST_RELEASE = "0005"
 # The address is not repeated: any part of it may be part of a password.
-_NO_ADDRESS = "is no address: write @, : and / in a password as %40, %3A and %2F"
+_NO_ADDRESS = "is no address: write %, @, :, / and ? in a password as %25, %40, %3A, %2F and %3F"
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,11 +210,10 @@ def _postgresql(url: str) -> sa.Engine:
 
     try:
         address = conninfo_to_dict(url)
-    except ProgrammingError as error:
-        unknown = str(error).startswith("invalid URI query parameter")
-        raise ValueError(str(error).strip() if unknown else _NO_ADDRESS) from None
-    places = [str(address.get(name, "")) for name in ("host", "port", "dbname")]
-    if "@" in "".join(places) or (not places[1].replace(",", "0").isdecimal() and places[1]):
+    except (ProgrammingError, UnicodeError):
+        raise ValueError(_NO_ADDRESS) from None
+    others = "".join(str(value) for name, value in address.items() if name not in ("user", "password"))
+    if "@" in others or not str(address.get("port") or 0).replace(",", "0").isdecimal():
         raise ValueError(_NO_ADDRESS)
     limits = {
         "connect_timeout": _CONNECT_S,
@@ -232,7 +231,4 @@ def _postgresql(url: str) -> sa.Engine:
 def cause(error: Exception) -> str:
     """An error in one line, without the SQL statement and its parameters; drivers write no password."""
     origin = getattr(error, "orig", None) or error
-    if "not null" in str(origin).lower() or "not-null" in str(origin):
-        # Only a conflict with other bytes sets a column to null.
-        return f"another program has written other events of the same mission: {str(origin).splitlines()[0]}"
     return str(origin).strip().splitlines()[0] if str(origin).strip() else type(origin).__name__

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import sqlalchemy as sa
 
 from service.storage.leases import LeaseLost, Leases
-from service.storage.operations import Change, Done, WriteFailed
+from service.storage.operations import Change, Done
 from service.storage.rows import Statement, Statements
 
 if TYPE_CHECKING:
@@ -93,9 +93,8 @@ class ThreadWriter:
             db.rollback()
             if lost := self._leases.lost(missions):
                 raise LeaseLost(lost) from None
-            raise WriteFailed(
-                "the database has gone back: it lacked leases of this edge, which has them again"
-            ) from None
+            # The database has gone back, and has the leases again.
+            self._transact(missions, transaction)
 
     def _disconnect(self) -> None:
         """Close the connection, which may be broken or in the midst of a transaction."""

@@ -42,8 +42,7 @@ Features = Literal["paper", "reach"]
 Belief = Literal["fleet", "reported"]
 # Version 0.1.0 had two more, which ``failures`` replaces.
 Selection = Annotated[
-    Literal["recent", "failures"],
-    BeforeValidator(lambda value: "failures" if value in ("similar", "best") else value),
+    Literal["recent", "failures"], BeforeValidator(lambda value: "failures" if value in ("similar", "best") else value)
 ]
 Source = Literal["llm", "guided", "value", "policy"]
 Uplink = Literal["full", "delta", "pruned"]

@@ -176,10 +176,7 @@ class PipelineWorld:
         failed, moved, blamed, cost = (column[0].tolist() for column in columns)
         return {
             agent: Info(
-                failed=bool(failed[uav]),
-                collected=int(moved[uav]),
-                lost_packets=int(blamed[uav]),
-                cost=cost[uav],
+                failed=bool(failed[uav]), collected=int(moved[uav]), lost_packets=int(blamed[uav]), cost=cost[uav]
             )
             for agent, uav in self.live.items()
         }

@@ -18,9 +18,10 @@ from service.config.settings import Settings
 from service.mission.events import GuidanceChanged
 from service.mission.resolved_spec import ResolvedSpec
 from service.storage.locks import StoreUnusable
-from service.storage.operations import Change, Entry, Made
+from service.storage.operations import Change, Checkpoint, Entry, Made
+from service.storage.rows import pack
 from service.storage.sqlite_writer import Database, identity
-from service.storage.store import Store, cause
+from service.storage.store import Store
 from shared.wire.schemas import MissionSpec
 from tests.support.stored_missions import commit_changes, fly, running, writers
 from tests.support.waiting import until
@@ -278,7 +279,7 @@ def made(mission_id: str, epoch: int = 0, **spec: Any) -> Made:
 
 
 @pytest.mark.parametrize("database", ["sqlite", "postgresql"])
-async def test_other_bytes_of_the_same_event_are_an_error(
+async def test_the_owner_overwrites_an_earlier_mission_of_the_same_id(
     tmp_path: Path, request: pytest.FixtureRequest, database: str
 ) -> None:
     url = str(tmp_path / "m.db") if database == "sqlite" else request.getfixturevalue("postgres")
@@ -291,15 +292,17 @@ async def test_other_bytes_of_the_same_event_are_an_error(
     writer = store.writer()
     right: list[Change] = [made("test", epoch), Entry("test", 1, GuidanceChanged({"note": "a"}), epoch)]
     await commit_changes(writer, right)
-    # A repeated event with the same bytes does no harm.
+    # A transaction may be repeated.
     await commit_changes(writer, right)
-    # A mission that is there stays as it was made.
-    await commit_changes(writer, [made("test", epoch, seed=7)])
-    with pytest.raises(Exception) as failed:
-        await commit_changes(writer, [Entry("test", 1, GuidanceChanged({"note": "b"}), epoch)])
-    assert cause(failed.value).startswith("another program has written other events of the same mission: ")
+    right += [Entry("test", seq, GuidanceChanged({"note": "old"}), epoch) for seq in (2, 3, 4)]
+    await commit_changes(writer, right)
+    own = [Entry("test", seq, GuidanceChanged({"note": f"own {seq}"}), epoch) for seq in (1, 2)]
+    await commit_changes(writer, [made("test", epoch, seed=7), *own])
+    # Its checkpoint after event 1 ends what the earlier one had beyond event 2.
+    await commit_changes(writer, [Checkpoint("test", 1, pack({"of": "its own"}), epoch, 2)])
     kept = store.load("test")
     assert kept is not None
-    assert (kept.events, kept.asked_for) == ([GuidanceChanged({"note": "a"})], MissionSpec())
+    assert (kept.seq, kept.state, kept.events) == (2, {"of": "its own"}, [GuidanceChanged({"note": "own 2"})])
+    assert kept.asked_for == MissionSpec(seed=7)
     writer.close()
     store.close()

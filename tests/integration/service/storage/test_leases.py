@@ -108,7 +108,11 @@ def test_a_database_that_has_gone_back_lost_no_lease(store: Store, edges: tuple[
         assert acquired(one, mission_id) == epoch
         expire(store)
         assert acquired(other, mission_id) == epoch + 1
+    # Nor is a live lease of a smaller epoch taken from its owner.
     assert one.lost([("old", 6), ("new", 4)]) == {("old", 6), ("new", 4)}
+    assert acquired(other, "old") == 7
+    assert one.lost([("old", 60)]) == {("old", 60)}
+    assert acquired(other, "old") == 7
 
 
 def test_the_epoch_grows_when_another_owner_takes_the_lease_and_never_shrinks(

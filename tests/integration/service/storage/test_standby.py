@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import httpx
 import psutil
 import psycopg
 import pytest
@@ -107,31 +108,48 @@ def restored(url: str, engine: Engine, mission_id: str) -> bool:
     return same(state(here), state(mission))
 
 
+def flown(client: httpx.Client, report: Report, mission_id: str, first: int, **spec: Any) -> dict[str, Any]:
+    """Make the mission, or fly it on; the first UAV's outcome, which is not reported yet."""
+    if not first:
+        client.put(f"/missions/{mission_id}", json=spec).raise_for_status()
+    steps = range(first, first + 3)
+    return {"mission_id": mission_id, **fly(client, lambda **own: report(mission_id=mission_id, **own), steps)[0]}
+
+
+def stored(client: httpx.Client, outcome: dict[str, Any]) -> bool:
+    answer = client.post("/feedback", json=outcome)
+    assert answer.status_code in (200, 503), answer.text
+    return answer.status_code == 200
+
+
 def test_a_standby_that_lags_loses_nothing_that_the_edge_has_in_memory(pair: Pair, report: Report) -> None:
     with running(pair.url, lease_s=30.0) as (client, engine):
-
-        def flown(mission_id: str, first: int) -> dict[int, dict[str, Any]]:
-            if not first:
-                client.put(f"/missions/{mission_id}", json={}).raise_for_status()
-            return fly(client, lambda **fields: report(mission_id=mission_id, **fields), range(first, first + 3))
-
-        flown("flown-on", 0)
-        flown("idle", 0)
+        for mission_id in ("flown-on", "idle", "made-anew"):
+            flown(client, report, mission_id, 0)
+            flown(client, report, mission_id, 3)
         pair.copy()
         # The standby has no row and no lease of the new ones, and not the newest events of the others.
-        pending = {"new": flown("new", 0)[0], "flown-on": flown("flown-on", 3)[0]}
-        flown("idle", 3)
-        flown("new-and-idle", 0)
+        pending = [flown(client, report, "new", 0), flown(client, report, "flown-on", 6)]
+        flown(client, report, "idle", 6)
+        flown(client, report, "new-and-idle", 0)
+        # It still has another mission of this ID, with more events.
+        client.delete("/missions/made-anew").raise_for_status()
+        pending.append(flown(client, report, "made-anew", 0, seed=7))
         pair.fail_over()
-
-        def stored(mission_id: str) -> bool:
-            answer = client.post("/feedback", json={"mission_id": mission_id, **pending[mission_id]})
-            assert answer.status_code in (200, 503), answer.text
-            return answer.status_code == 200
-
-        for mission_id in pending:
-            until(partial(stored, mission_id))
-        for mission_id in ("flown-on", "idle", "new", "new-and-idle"):
+        for outcome in pending:
+            until(partial(stored, client, outcome))
+        for mission_id in ("flown-on", "idle", "new", "new-and-idle", "made-anew"):
             until(partial(restored, pair.url, engine, mission_id))
         with psycopg.connect(pair.url) as db:
-            assert db.execute("SELECT count(*), max(epoch) FROM leases").fetchone() == (4, 1)
+            assert db.execute("SELECT count(*), max(epoch) FROM leases").fetchone() == (5, 1)
+
+
+def test_an_edge_that_writes_nothing_sees_another_database_too(pair: Pair, report: Report) -> None:
+    with running(pair.url, lease_s=2.0) as (client, engine):
+        flown(client, report, "old", 0)
+        pair.copy()
+        flown(client, report, "old", 3)
+        flown(client, report, "new", 0)
+        pair.fail_over()
+        for mission_id in ("old", "new"):
+            until(partial(restored, pair.url, engine, mission_id))
