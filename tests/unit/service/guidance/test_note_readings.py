@@ -96,6 +96,8 @@ async def test_where_the_rules_read_nothing_equal_readings_that_words_confirm_ha
         ("Sensor 4 is dead.", {"weight:4": 0.0}, True),
         ("What sensor 4 loses counts double.", {"weight:4": 2.0}, True),
         ("Up to 36 km/h.", {"max_velocity": 10}, True),
+        ("The yard sees to its own sensor 7 every 3 steps, nothing to do with us.", {"visit:7": 3}, False),
+        ("Sensor 7 gets a visit every 3 steps. I only pass this on.", {"visit:7": 3}, False),
     ],
 )
 def test_a_word_of_its_kind_in_its_sentence_confirms_an_order(

@@ -177,6 +177,11 @@ At sensor 4 nobody flies faster than 5 m/s.
 Sensor 4 needs a factor of 3 fewer visits.
 Sensor 4's packets are worth nothing compared to sensor 5.
 Half the fleet visits sensor 4 every 3 steps.
+The instruction I gave you about sensor 2 this morning, kindly disregard it.
+Please ignore the message we sent on sensor 5.
+Disregard what I wrote: sensor 4.
+Sensor 4 counts 20% more than normal.
+Let the weight of sensor 4 be ten percent lower.
 """
 
 
