@@ -70,9 +70,11 @@ def test_an_address_that_is_none_is_refused_and_no_password_is_told(url: str) ->
 @pytest.mark.parametrize("scheme", ["postgresql", "postgres", "postgresql+psycopg"])
 def test_an_address_is_read_as_postgresqls_own_programs_read_it(postgres: str, scheme: str) -> None:
     folder = parse_qs(urlsplit(postgres).query)["host"][0].replace("/", "%2F")
-    # Nobody is at the first.
+    # No server listens at the first address.
     url = f"{scheme}://postgres@%2Fnowhere:5433,{folder}:5432/postgres?target_session_attrs=read-write"
-    Store(f"{url}&application_name=edge").close()
+    store = Store(f"{url}&application_name=edge")
+    assert store.leases is not None
+    store.close()
 
 
 def _migrations() -> Config:
