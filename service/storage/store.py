@@ -187,7 +187,7 @@ def _engine(url: str) -> sa.Engine:
     scheme, is_url, address = url.partition("://")
     if scheme in ("postgresql", "postgres", "postgresql+psycopg"):
         return _postgresql(f"postgresql://{address}")
-    if not is_url:
+    if not is_url and not url.startswith(("postgres:", "postgresql:")):
         Path(url).expanduser().parent.mkdir(parents=True, exist_ok=True)
         url = f"sqlite:///{Path(url).expanduser()}"
     try:

@@ -54,6 +54,7 @@ def test_a_store_that_cannot_be_used_is_refused_with_the_reason(
         "postgresql://u:p@hunter2@h/d",
         "postgresql://u:p/hunter2@h/d",
         "postgresql://hunter2:p/1@h/d",
+        "postgresql:/u:hunter2@h/d",
         "postgresql://u:12/ss?hunter2=x@h/d",
         "postgresql://u:1/b?connect_timeout=hunter2@h/d",
         "postgresql://u:%ffhunter2@127.0.0.1:1/d",
