@@ -211,7 +211,7 @@ class Journal:
     async def close(self, within_s: float) -> bool:
         """Write the queue once more; returns whether that has ended, so that the store may be closed."""
         ends = self._loop.time() + within_s
-        self.on_recovery = lambda: None
+        self.on_recovery = lambda: None  # Nothing can be packed any more.
         if self._packed:
             await asyncio.wait(self._packed, timeout=within_s)
         self._packing.shutdown(wait=False, cancel_futures=True)

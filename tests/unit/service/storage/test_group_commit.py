@@ -92,3 +92,13 @@ async def test_a_failure_is_a_fault_only_while_it_lasts(monkeypatch: pytest.Monk
     commits.add(Deleted("b"))
     assert not await commits.stored(60.0)
     assert commits.failing and commits.fault is None
+
+
+@pytest.mark.parametrize(("failures", "written"), [(1, ["a"]), (2, [])])
+async def test_a_queue_that_is_closed_is_tried_twice(failures: int, written: list[str]) -> None:
+    """The first try may meet a connection to a database that has ended."""
+    disk, recoveries = Disk(*[FULL] * failures), list[None]()
+    commits = GroupCommit(disk, Metrics(), lambda mission_id, epoch: None, lambda: recoveries.append(None))
+    commits.add(Deleted("a"))
+    assert await commits.close(asyncio.get_running_loop().time() + 10)
+    assert (disk.written, len(recoveries)) == (written, len(written))
