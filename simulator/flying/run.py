@@ -83,31 +83,26 @@ def run_mission(
     code = _write_results(job, flight, others, created.mode, model, extra, console)
     if pilot.last_error is not None:
         unanswered = sum(decision.source == "onboard" for decision in flight.decisions)
-        print(
-            f"{unanswered} decisions were taken on board. The edge's last failure: {pilot.last_error}", file=sys.stderr
-        )
+        taken = f"{unanswered} decisions were taken on board. " if unanswered else ""
+        print(f"{taken}The edge's last failure: {pilot.last_error}", file=sys.stderr)
     return code or (1 if flight.decisions and not pilot.answered else 0)
 
 
 class _ProgressText:
     """The text of the progress line: packets lost and sources so far, or the cause of a wait.
 
-    It also forwards decisions and steps to ``metrics``.
+    It calls ``update`` with each new text, and forwards decisions and steps to ``metrics``.
     """
 
     def __init__(self, metrics: FlightMetrics | None) -> None:
         self._metrics = metrics
-        self._update: Callable[[str], None] = lambda text: None
+        self.update: Callable[[str], None] = lambda text: None
         self._lost = 0
         self._sources: Counter[str] = Counter()
 
-    def show_with(self, update: Callable[[str], None]) -> None:
-        """Display the text by calling ``update``."""
-        self._update = update
-
     def on_wait(self, cause: str) -> None:
         """Show that the fleet waits for a lost edge."""
-        self._update(f"waiting for the edge: {escape(cause)}")
+        self.update(f"waiting for the edge: {escape(cause)}")
 
     def on_decision(self, choice: PilotChoice) -> None:
         """Count and show a decision."""
@@ -115,14 +110,14 @@ class _ProgressText:
             self._metrics.count_decision(choice)
         self._sources[choice.source] += 1
         trip = f", {choice.exchange.rtt_ms:.0f} ms" if choice.exchange else ""
-        self._update(f"{self._lost} lost; {choice.source} decides{trip}")
+        self.update(f"{self._lost} lost; {choice.source} decides{trip}")
 
     def on_step(self, flight: Flight) -> None:
         """Count and show a step of the whole fleet."""
         if self._metrics is not None:
             self._metrics.count_step(flight)
         self._lost += flight.tally[-1].lost_packets
-        self._update(f"{self._lost} lost; {sources_text(BySource(**self._sources))}")
+        self.update(f"{self._lost} lost; {sources_text(BySource(**self._sources))}")
 
 
 def _columns() -> tuple[ProgressColumn, ...]:
@@ -143,7 +138,7 @@ def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Fligh
         log = DecisionLog(job.out / DECISIONS)
     with log, Progress(*_columns(), console=console) as progress:
         task = progress.add_task("Flying", total=job.site.scenario.steps, text="")
-        text.show_with(lambda shown: progress.update(task, text=shown))
+        text.update = lambda shown: progress.update(task, text=shown)
 
         began = time.monotonic()
 

@@ -117,6 +117,8 @@ class EdgeStub:
     async def feedback(self, request: Request) -> Response:
         """POST /feedback."""
         outcome = FeedbackRequest.model_validate_json(await request.body())
+        if not self.script and self.otherwise == "crash":
+            return Response(status_code=500)
         self.feedbacks.append(outcome)
         return Response(FeedbackResponse(decision_id=outcome.decision_id, result="applied").model_dump_json())
 

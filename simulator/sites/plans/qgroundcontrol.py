@@ -34,10 +34,12 @@ from simulator.sites.plans.mission_path import (
 MAX_BYTES = 20_000_000
 MAX_ITEMS = 10_000
 # Members that say nothing of the path, or the same again.
-_UNUSED = {"groundStation", "plannedHomePosition", "cruiseSpeed", "hoverSpeed", "firmwareType", "vehicleType"} | {
+_UNUSED = {"groundStation", "plannedHomePosition", "cruiseSpeed", "hoverSpeed", "firmwareType"} | {
     "globalPlanAltitudeMode", "Altitude", "AltitudeMode", "AMSLAltAboveTerrain", "MISSION_ITEM_ID"
 }  # fmt: skip
 _LANDING_PATTERNS = {"fwlandingpattern", "vtollandingpattern"}
+# Members of MAV_TYPE that do not fly: https://mavlink.io/en/messages/common.html#MAV_TYPE
+_GROUNDED: dict[float | None, str] = {10: "a ground rover", 11: "a boat", 12: "a submarine"}
 
 
 class _PlanPart(BaseModel):
@@ -76,6 +78,7 @@ class _ComplexItem(_PlanPart):
 
 class _Mission(_PlanPart):
     version: Literal[2] = 2
+    vehicleType: float | None = None
     items: list[Annotated[_SimpleItem | _ComplexItem, Field(discriminator="type")]] = Field(max_length=MAX_ITEMS)
 
 
@@ -232,6 +235,8 @@ def _notes(plan: _Plan) -> list[str]:
     simple = [item for item in plan.mission.items if isinstance(item, _SimpleItem)]
     unread = plan.unread.union(plan.mission.unread, *(item.unread for item in simple))
     notes = [f"not read, for it is not known: {quoted(name)}." for name in sorted(unread)]
+    if grounded := _GROUNDED.get(plan.mission.vehicleType):
+        notes.append(f"mission.vehicleType: the plan is for {grounded}; its path is a UAV's here.")
     if plan.rallyPoints.points:
         notes.append(f"passed over: {len(plan.rallyPoints.points)} rally points, which are the autopilot's.")
     if plan.geoFence.breachReturn is not None:

@@ -282,6 +282,17 @@ def test_an_edge_that_never_decides_is_code_1(
     assert summary_in(tmp_path).by_reason == {"edge_refused": 6}
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_an_edge_that_refuses_the_last_outcomes_is_named(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every decision was the edge's, so none is said to be taken on board."""
+    stub.script, stub.otherwise = ["ok"] * 6, "crash"
+    assert simulate.main(["--edge", stub.url, "--steps", "2", "--out", str(tmp_path)]) == 0
+    error = capsys.readouterr().err
+    assert "The edge's last failure: " in error and "/feedback" in error and "on board" not in error
+
+
 @pytest.mark.long
 def test_sigterm_leaves_a_partial_result(stub: EdgeStub, tmp_path: Path) -> None:
     # It is interrupted while the eighth decision is waited for: the second of the third step.

@@ -149,6 +149,16 @@ def test_an_import_says_what_a_world_has_not(tmp_path: Path) -> None:
         assert said in notes
 
 
+@pytest.mark.parametrize(
+    ("vehicle", "named"), [(10, "a ground rover"), (11, "a boat"), (12, "a submarine"), (2, ""), (None, "")]
+)
+def test_a_plan_for_a_vehicle_that_does_not_fly_says_so(tmp_path: Path, vehicle: int | None, named: str) -> None:
+    document = plan(*TRIANGLE)
+    document["mission"]["vehicleType"] = vehicle
+    notes = "\n".join(read_plan(write(tmp_path / "a.plan", document)).notes)
+    assert ("vehicleType" in notes) == bool(named) and named in notes
+
+
 @pytest.mark.parametrize("kind", ["fwLandingPattern", "vtolLandingPattern"])
 def test_a_landing_pattern_is_a_landing(tmp_path: Path, kind: str) -> None:
     pattern = {"type": "ComplexItem", "complexItemType": kind, "landCoordinate": [39.9, 41.4, 0]}
