@@ -142,7 +142,7 @@ class LlmQueries:
     def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:
         """Whether one query can serve this many UAVs: mode ``guided``, a capable server, a sufficient context."""
         server = self._llm.serving(mission.mission_id)
-        able = server.status.llm == "ready" and uavs <= server.max_uavs_per_call
+        able = server.status.llm == "ready" and uavs <= server.connection.abilities.max_uavs_per_call
         return able and mission.mode == "guided" and uavs > 1 and mission.prompt_fit.fits(uavs)
 
     async def ask_for_fleet(

@@ -36,6 +36,8 @@ SILENCE_S = 0.5
 _PATIENCE_S = 10.0
 log = logging.getLogger(__name__)
 RETRY_S = 5.0
+# A probe that fails within this time costs its server next to nothing.
+_AT_ONCE_S = 1.0
 # Message to a call that is cancelled because an earlier call was answered, which is no failure of this server.
 EARLIER_CALL_ANSWERED = "another answered"
 
@@ -135,11 +137,6 @@ class LlmServer:
     def recovering(self) -> bool:
         """Whether an LLM that is not ready may become ready without a restart."""
         return self._task is not None and not self._task.done()
-
-    @property
-    def max_uavs_per_call(self) -> int:
-        """Number of UAVs that one call may decide for."""
-        return self.connection.abilities.max_uavs_per_call
 
     @property
     def paused(self) -> bool:
@@ -272,6 +269,7 @@ class LlmServer:
         """After the breaker has opened: pause and probe, until a probe is answered."""
         while True:
             await asyncio.sleep(self._breaker.pause_s)
+            started = time.monotonic()
             try:
                 await self.connection.ping()
             except (NotUnderstood, Unreachable) as error:
@@ -280,7 +278,9 @@ class LlmServer:
                 self.start()
                 return
             except Exception as error:
-                self._breaker.failed()
+                # A gateway refuses at once while the server behind it starts.
+                if time.monotonic() - started > _AT_ONCE_S:
+                    self._breaker.failed()
                 failed = f"still fails, next try in {self._breaker.pause_s:g} s: {error}"
                 self.status = ServerStatus("unavailable", failed, breaker_open=True)
                 log.warning("LLM %s", failed)

@@ -133,7 +133,7 @@ class ServerPool:
 
     def _first(self, mission_id: str, call: Call, uavs: int = 1) -> Answer:
         """The first answer of the ready servers."""
-        ready = [server for server in self._each if server.status.llm == "ready" and server.max_uavs_per_call >= uavs]
+        ready = [s for s in self._each if s.status.llm == "ready" and s.connection.abilities.max_uavs_per_call >= uavs]
         if len(ready) > 1:
             # A stable sort: where every server is full, the order is as without a limit.
             ready = sorted(self._ordered(mission_id, ready), key=lambda each: self._calls[each] >= self._slots)

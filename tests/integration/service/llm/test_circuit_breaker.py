@@ -14,7 +14,7 @@ import pytest
 from fastapi.responses import JSONResponse, Response
 
 from service.config.settings import Settings
-from service.llm.answers import Busy, Completion
+from service.llm.answers import Busy, Completion, NoDecision
 from service.llm.client import LLMClient
 from service.llm.embedded import EmbeddedServer
 from service.llm.request_bodies import WarmUp
@@ -260,4 +260,32 @@ async def test_a_server_that_asks_for_a_pause_while_it_starts_gets_it(monkeypatc
     await soon(lambda: pauses)
     assert pauses == [60.0]
     assert server.readiness().detail == "HTTP 503"
+    await server.close()
+
+
+@pytest.mark.parametrize(("stride_s", "expected"), [(0.1, [5.0, 5.0, 5.0]), (100.0, [5.0, 10.0, 20.0])])
+async def test_a_server_that_refuses_at_once_is_probed_every_five_seconds(
+    monkeypatch: pytest.MonkeyPatch, stride_s: float, expected: list[float]
+) -> None:
+    """A gateway answers 503 while the server behind it starts. A probe that a server is slow to fail costs it time."""
+    pauses: list[float] = []
+
+    class Gateway(LLMClient):
+        async def complete(self, body: dict[str, Any], session: str | None = None) -> Completion:
+            raise NoDecision("llm_status", "HTTP 503: no available workers")
+
+    async def pause(seconds: float) -> None:
+        pauses.append(seconds)
+        if len(pauses) == len(expected):
+            await asyncio.Event().wait()
+
+    monkeypatch.setattr("service.llm.server.time", Striding(stride_s))
+    monkeypatch.setattr("service.llm.server.asyncio", SimpleNamespace(**{**vars(asyncio), "sleep": pause}))
+    server = LlmServer(Settings(mode="llm"), WarmUp("", "", None))
+    server.status, server.connection.client = ServerStatus("ready"), Gateway("http://localhost/v1")
+    for _ in range(3):
+        with pytest.raises(NoDecision):
+            await server.ask_labels("test", "", "", [["A", "B"]])
+    await soon(lambda: len(pauses) == len(expected))
+    assert pauses == expected
     await server.close()
