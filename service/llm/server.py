@@ -36,7 +36,7 @@ SILENCE_S = 0.5
 _PATIENCE_S = 10.0
 log = logging.getLogger(__name__)
 RETRY_S = 5.0
-# A probe that fails within this time costs its server next to nothing.
+# A probe that fails within this time costs next to nothing: gateways refuse it while the server behind them starts.
 _AT_ONCE_S = 1.0
 # Message to a call that is cancelled because an earlier call was answered, which is no failure of this server.
 EARLIER_CALL_ANSWERED = "another answered"
@@ -267,8 +267,9 @@ class LlmServer:
 
     async def _recover(self) -> None:
         """After the breaker has opened: pause and probe, until a probe is answered."""
+        pause_s = self._breaker.pause_s
         while True:
-            await asyncio.sleep(self._breaker.pause_s)
+            await asyncio.sleep(pause_s)
             started = time.monotonic()
             try:
                 await self.connection.ping()
@@ -278,10 +279,10 @@ class LlmServer:
                 self.start()
                 return
             except Exception as error:
-                # A gateway refuses at once while the server behind it starts.
                 if time.monotonic() - started > _AT_ONCE_S:
                     self._breaker.failed()
-                failed = f"still fails, next try in {self._breaker.pause_s:g} s: {error}"
+                pause_s = max(self._breaker.pause_s, error.pause_s if isinstance(error, Busy) else 0.0)
+                failed = f"still fails, next try in {pause_s:.3g} s: {error}"
                 self.status = ServerStatus("unavailable", failed, breaker_open=True)
                 log.warning("LLM %s", failed)
             else:

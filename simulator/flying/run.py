@@ -139,7 +139,6 @@ def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Fligh
     with log, Progress(*_columns(), console=console) as progress:
         task = progress.add_task("Flying", total=job.site.scenario.steps, text="")
         text.update = lambda shown: progress.update(task, text=shown)
-
         began = time.monotonic()
 
         def stepped(flight: Flight) -> None:

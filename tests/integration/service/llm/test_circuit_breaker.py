@@ -263,15 +263,21 @@ async def test_a_server_that_asks_for_a_pause_while_it_starts_gets_it(monkeypatc
     await server.close()
 
 
-@pytest.mark.parametrize(("stride_s", "expected"), [(0.1, [5.0, 5.0, 5.0]), (100.0, [5.0, 10.0, 20.0])])
+@pytest.mark.parametrize(
+    ("stride_s", "asked", "expected"),
+    [(0.1, None, [5.0, 5.0, 5.0]), (100.0, None, [5.0, 10.0, 20.0]), (0.0, 30.0, [5.0, 30.0, 30.0])],
+)
 async def test_a_server_that_refuses_at_once_is_probed_every_five_seconds(
-    monkeypatch: pytest.MonkeyPatch, stride_s: float, expected: list[float]
+    monkeypatch: pytest.MonkeyPatch, stride_s: float, asked: float | None, expected: list[float]
 ) -> None:
-    """A gateway answers 503 while the server behind it starts. A probe that a server is slow to fail costs it time."""
+    """A gateway answers 503 while the server behind it starts, or asks for a pause. A slow failure costs time."""
     pauses: list[float] = []
+    asks = False
 
     class Gateway(LLMClient):
         async def complete(self, body: dict[str, Any], session: str | None = None) -> Completion:
+            if asks and asked:
+                raise Busy("HTTP 429: no deployments", 1000.0 + asked)
             raise NoDecision("llm_status", "HTTP 503: no available workers")
 
     async def pause(seconds: float) -> None:
@@ -279,6 +285,7 @@ async def test_a_server_that_refuses_at_once_is_probed_every_five_seconds(
         if len(pauses) == len(expected):
             await asyncio.Event().wait()
 
+    monkeypatch.setattr("service.llm.answers.time", Striding(0.0))
     monkeypatch.setattr("service.llm.server.time", Striding(stride_s))
     monkeypatch.setattr("service.llm.server.asyncio", SimpleNamespace(**{**vars(asyncio), "sleep": pause}))
     server = LlmServer(Settings(mode="llm"), WarmUp("", "", None))
@@ -286,6 +293,7 @@ async def test_a_server_that_refuses_at_once_is_probed_every_five_seconds(
     for _ in range(3):
         with pytest.raises(NoDecision):
             await server.ask_labels("test", "", "", [["A", "B"]])
+    asks = True
     await soon(lambda: len(pauses) == len(expected))
     assert pauses == expected
     await server.close()
