@@ -51,9 +51,8 @@ class End(Received):
     def __str__(self) -> str:
         if self.step is not None or self.steps is not None:
             return f"for {self.steps} steps" if self.step is None else f"until step {self.step}"
-        return (
-            f"until {self.time.isoformat(' ', 'minutes')}" if self.time else f"until sensor {self.visited} was visited"
-        )
+        end = self.time.isoformat(" ", "minutes") if self.time else f"sensor {self.visited} was visited"
+        return f"until {end}"
 
 
 class SensorWish(Received):

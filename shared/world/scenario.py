@@ -207,16 +207,13 @@ class Scenario(Unmodelled):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.arrival_rate_min > self.arrival_rate_max:
-            raise ValueError("arrival_rate_min exceeds arrival_rate_max")
-        if self.initial_queue_min > self.initial_queue_max:
-            raise ValueError("initial_queue_min exceeds initial_queue_max")
+        for name in ("arrival_rate", "initial_queue"):
+            if getattr(self, f"{name}_min") > getattr(self, f"{name}_max"):
+                raise ValueError(f"{name}_min exceeds {name}_max")
         if self.layout == "pipeline" and not self.pipeline:
             raise ValueError("layout pipeline needs a pipeline of at least two points")
         if self.layout == "surveyed" and len(self.sites) != self.sensors:
-            raise ValueError(
-                f"layout surveyed needs a site for each of {self.sensors} sensors, sites has {len(self.sites)}"
-            )
+            raise ValueError(f"layout surveyed has {len(self.sites)} sites for {self.sensors} sensors")
         if self.sites and not all(0 <= value <= self.area_m for site in self.sites for value in site):
             raise ValueError(f"sites has a position outside the area of 0..{self.area_m:g} m")
         if self.routes and len(self.routes) != self.uavs:
@@ -231,6 +228,10 @@ class Scenario(Unmodelled):
         if self.sensors * self.steps > _MAX_ARRIVALS:
             raise ValueError(f"sensors x steps exceeds {_MAX_ARRIVALS:,}: a world draws that many arrivals at once")
         return self
+
+    def __hash__(self) -> int:
+        # Of few fields: hashing each point of a large site takes as long as a decision.
+        return hash((self.name, self.sensors, self.uavs, self.steps, self.sites[:1], self.routes and self.routes[0][0]))
 
     @property
     def lap_centres(self) -> tuple[Point, ...]:
