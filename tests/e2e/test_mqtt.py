@@ -135,7 +135,7 @@ def test_uplinks_reach_the_mission(
             there.publish(topic("kp-2"), payload)
         there.publish("application/other/device/x/event/up", message(device=2))
         there.publish(topic("kp-2"), message(device=2, queue=60, at=ago(0)))
-        until(lambda: numbers(metrics)['aicvds_mqtt_readings_total{result="merged"}'] == 3 or merged(wide) == 3)
+        until(lambda: numbers(metrics).get('aicvds_mqtt_readings_total{result="merged"}') == 3 or merged(wide) == 3)
         until(lambda: numbers(metrics).get('aicvds_mqtt_uplinks_total{result="accepted"}') == 4)
         reported = numbers(metrics)
         for result in ("unknown_device", "no_queue", "unreadable"):
