@@ -54,7 +54,7 @@ class Fly:
 
       aicvds fly --mavlink udpin://0.0.0.0:14540 --world line --edge URL --mission line-1
 
-    On board of UAV 2 alone:
+    On board UAV 2 alone:
 
       aicvds fly --mavlink serial:///dev/ttyACM0:57600 --uav 2 --world line --edge URL --mission line-1
 

@@ -50,12 +50,12 @@ class ServeOptions:
     llm_url: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
     """An LLM server with OpenAI's interface, up to and including /v1. Default: AICVDS_LLM_URL, or the embedded LLM."""
     llm_model: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """The model at that server. Default: AICVDS_LLM_MODEL, or the first that it lists."""
-    store: Annotated[str | None, tyro.conf.arg(metavar="FILE|none", help_behavior_hint="")] = None
-    """SQLite file of the missions; none: they end with the process. Default: AICVDS_STORE, or a file in your home."""
+    """The model at that server. Default: AICVDS_LLM_MODEL, or its first chat model."""
+    store: Annotated[str | None, tyro.conf.arg(metavar="FILE|URL|none", help_behavior_hint="")] = None
+    """SQLite file, or URL of a PostgreSQL, for the missions; none: memory. Default: AICVDS_STORE, or a file at home."""
 
     ray: Annotated[str | None, tyro.conf.arg(metavar="local|auto|HOST:PORT", help_behavior_hint="")] = None
-    """Be the ingress of edges on Ray: on one that starts here (local), or on the cluster of this machine. Needs the
+    """Be the ingress of edges on Ray: on a Ray that starts here (local), or on the cluster of this machine. Needs the
     extra `ray`, and PostgreSQL."""
     replicas: Annotated[str, tyro.conf.arg(metavar="N|N-M")] = "1-4"
     """With --ray: how many edges, or from how many to how many, by load."""

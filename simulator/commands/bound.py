@@ -19,8 +19,8 @@ class BoundOptions(WorldOptions):
     """Find the least packets that any fleet could have lost in one world.
 
     A planner that knows every arrival beforehand, as no UAV does, searches for the best flight with OR-Tools CP-SAT and
-    proves a bound on any better one. No scheme loses less than the proven bound. A scheme's losses above it are those
-    that better decisions could save.
+    proves a bound on any better one. No scheme loses less than the proven bound. Better decisions could save
+    at most a scheme's losses above it.
 
     Printed: the proven bound, the losses of the best plan found, the gap between them, and EOF's losses in the same
     world. The plan is flown in the simulated world, which must lose exactly the packets of the plan. In a scenario that
@@ -107,4 +107,4 @@ def _show(record: BoundRecord, console: Console) -> None:
     table.add_row("gap", "0: proven optimal" if record.optimal else str(record.gap))
     table.add_row("EOF", str(record.eof_lost_packets))
     console.print(table)
-    console.print(f"Searched {record.seconds:.1f} s. The flight was flown in the world and lost just that.")
+    console.print(f"Searched {record.seconds:.1f} s. The plan was flown in the world and lost exactly that.")

@@ -22,8 +22,8 @@ class Demo(WorldOptions):
     """Start an edge on this machine, fly a mission against it, and compare with EOF and WQCS.
 
     The edge loads its LLM (the embedded one, or that of the AICVDS_LLM_* variables), decides for three UAVs at thirty
-    waypoints each, then in the same world without the LLM, and stops. Written to --out: report.html (open it in a
-    browser), summary.json, decisions.jsonl and edge.log. The results of an earlier demo there are overwritten.
+    waypoints each, then in the same world without the LLM, and stops. Written to --out, over those of an
+    earlier demo: report.html (open it in a browser), summary.json, figures, decisions.jsonl, requests.jsonl, edge.log.
 
     Try it:  aicvds demo --out runs/demo
 

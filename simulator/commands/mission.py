@@ -24,7 +24,7 @@ class Create:
     """Make a mission at an edge for your world, and print a /decide request for its sensors that works as pasted.
 
     The edge learns the world: its sensors, trajectories and numbers. The request printed is UAV 0's at step 0; put what
-    your UAV knows in the place of its queues, batteries, gains and steps. The environment variable AICVDS_API_KEY has a
+    your UAV knows in place of its queues, batteries, gains and steps. The environment variable AICVDS_API_KEY has a
     key of scope admin for an edge that needs one. Exit code: 0 done, 1 no edge, 2 bad use.
 
     Try it:  aicvds mission create --edge http://127.0.0.1:8000 --world examples/pipeline_world
@@ -35,7 +35,7 @@ class Create:
     world: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
     """A folder with world.geojson and, optionally, scenario.toml and arrivals.csv, as examples/pipeline_world."""
     scenario: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """A ready-made world instead: paper (the default), paper_light, pipeline, stress, dense or lossy_uplink."""
+    """A ready-made world instead: paper (the default) or one of those in `aicvds simulate --help`."""
     mission: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
     """The mission's ID. Default: a new one, such as pipeline_world-0-1f6c09ab."""
     mode: Annotated[Mode | None, arg(metavar="guided|llm|value|policy", help_behavior_hint="")] = None

@@ -45,7 +45,7 @@ class Replay:
 
     The same edge with another prompt, or without its LLM:
 
-      aicvds replay runs/first --edge http://127.0.0.1:8000 --mode value --top-k 3
+      aicvds replay runs/first --edge http://127.0.0.1:8000 --top-k 3
 
       aicvds replay runs/first --edge http://127.0.0.1:8000 --mode value
 

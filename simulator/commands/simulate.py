@@ -38,7 +38,7 @@ class Simulate(WorldOptions):
 
     The UAVs fly the scenario's world step by step, ask the edge for a decision at every waypoint, and report the cost
     of each decision. EOF and WQCS then fly the same world for comparison. Written to --out: summary.json,
-    decisions.jsonl (one decision a line, written at once), report.html (open it in a browser) and, with an edge,
+    decisions.jsonl (one decision a line, written at once), report.html (open it in a browser), figures, with an edge
     requests.jsonl (the requests, about 1 kB a decision with 10 sensors, for `aicvds replay`).
 
     Start an edge, then fly against it from another terminal:
