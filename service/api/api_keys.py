@@ -23,8 +23,7 @@ from shared.kit.validation_messages import problem_of
 
 log = logging.getLogger(__name__)
 
-# `decide`: request decisions, report outcomes, read. `admin`: make, guide and delete missions. `readings`: report what
-# sensors say of themselves.
+# `decide`: request decisions, report outcomes, read. `admin`: make, guide, delete missions. `readings`: report sensors.
 Scope = Literal["decide", "admin", "readings"]
 # A mission's ID, or the beginning of IDs and `*`.
 Missions = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\*?$")]

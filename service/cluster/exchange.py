@@ -10,6 +10,7 @@ from typing import Any
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope
 
+from service.api.problem_details import CONTENT_TYPE, problem_response
 from shared.wire.missions import MissionLine, MissionList
 from shared.wire.schemas import Readiness
 
@@ -58,7 +59,9 @@ def merged_metrics(answers: Mapping[str, Answer]) -> Response:
 
 def merged_readiness(answers: Iterable[Answer]) -> Response:
     """Ready if all edges are; the LLM is ready if all have reached it."""
-    found = [Readiness.model_validate_json(a.body) for a in answers if a.status in (200, 503)]
+    found = [Readiness.model_validate_json(a.body) for a in answers if a.header("content-type") != CONTENT_TYPE]
+    if not found:
+        return problem_response(503, "no edge says whether it is ready: send the request again")
     shown = min(found, key=lambda one: (one.ready, one.llm == "ready"))
     return Response(shown.model_dump_json(), 200 if shown.ready else 503, media_type="application/json")
 

@@ -85,7 +85,7 @@ class Ingress:
             return _merged(request.scope["path"], await self._owners.ask_all(request, within_s))
         if request.lacks_mission:
             answers = await self._owners.ask_all(request, within_s)
-            return _passed_on(min(answers.values(), key=lambda answer: answer.status == 404))
+            return _passed_on(min(answers.values(), key=lambda answer: (answer.status >= 300, answer.status == 404)))
         return _passed_on(await self._answer(request, within_s))
 
     async def _answer(self, request: Exchanged, within_s: float) -> Answer:

@@ -79,16 +79,14 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix="AICVDS_", frozen=True, extra="forbid", env_ignore_empty=True)
 
-    # URL of an OpenAI-compatible server, up to and including /v1, or of several, separated by commas. Unset: the
-    # embedded llama.cpp.
+    # URL of an OpenAI-compatible server, with its /v1, or several, separated by commas. Unset: the embedded llama.cpp.
     llm_url: str | None = None
     # Name of the model, or one for each server. Unset: the first model that the server lists.
     llm_model: str | None = None
     # Bearer token for all servers, or one for each.
     llm_api_key: SecretStr | None = None
     # The order in which several servers are called: that of their URLs (`preference`), or one derived from the
-    # mission's ID (`mission`), which distributes missions evenly and keeps each at the server whose prefix cache has
-    # its prompts.
+    # mission's ID (`mission`), which keeps each mission at the server whose prefix cache has its prompts.
     llm_order: Literal["preference", "mission"] = "preference"
     # Concurrent calls of this edge to one of several servers before the next server gets them. 0: any number.
     llm_slots: int = Field(0, ge=0, le=10_000)
@@ -102,8 +100,7 @@ class Settings(BaseSettings):
     llm_extra_headers: JsonTexts = Field(default_factory=dict, repr=False)
     # Further parameters of the server's URLs, a JSON object of texts: {"api-version": "preview"}.
     llm_extra_query: JsonTexts = Field(default_factory=dict, repr=False)
-    # Most tokens that a model may think before its answer. The edge begins without any, and raises them when an answer
-    # ends before it has begun. 0: never.
+    # Most tokens that a model may think before its answer, allowed once an answer ends before it has begun. 0: none.
     llm_thinking_tokens: int = Field(2048, ge=0, le=131_072)
     # Seconds for which the first request may wait, while the server loads its model.
     llm_load_s: float = Field(300.0, ge=1, le=3600)
@@ -113,8 +110,7 @@ class Settings(BaseSettings):
     # Model file of the embedded llama.cpp. Unset: the one of `aicvds model fetch`.
     llm_gguf: Path | None = None
     # LoRA adapter of the embedded LLM, a GGUF file of `python -m lab distill`. Unset: the package's own, if it has one.
-    # `off`: none. `served`: the server of AICVDS_LLM_URL applies it. Missions then have the prompt that it was trained
-    # on.
+    # `off`: none. `served`: the server of AICVDS_LLM_URL applies it. Missions then have the adapter's own prompt.
     llm_adapter: str | None = None
     # LoRA adapter with which the embedded LLM reads operators' notes, a GGUF file of `python -m lab distill-orders`.
     # Unset: the package's own, if it has one. `off`: none.
@@ -149,8 +145,7 @@ class Settings(BaseSettings):
     price_cached: float = Field(0.0, ge=0)
     price_output: float = Field(0.0, ge=0)
 
-    # Most decisions that wait for the LLM. The policy makes further ones immediately: they would only share the LLM's
-    # time.
+    # Most decisions that wait for the LLM. The policy makes further ones: they would only share the LLM's time.
     llm_concurrency: int = Field(64, ge=1, le=10_000)
     # Address and port of `aicvds serve`. In a container the image sets both.
     host: str = "127.0.0.1"
@@ -170,8 +165,7 @@ class Settings(BaseSettings):
     # Whether an LLM's answer must obey hard rules in mode `llm`: sensor in reach, battery not flat. The policy
     # overrides an answer that breaks one. `off` is the paper's method as published.
     verify: Literal["on", "off"] = "on"
-    # The store of the missions: a SQLite file, or postgresql://user:password@host/database. `none`: missions end with
-    # the process.
+    # The store of the missions: a SQLite file, or postgresql://user:password@host/database. `none`: memory alone.
     store: str = Field(default_factory=_default_store, min_length=1, repr=False)
     # With several edges on one PostgreSQL: the address to which the other edges redirect clients. Unset: from --host
     # and --port, with this machine's name in place of 0.0.0.0.

@@ -176,8 +176,7 @@ class Deliberation:
         """Packets lost above the best candidate, or above the plan's action unless that loses far more.
 
         The plan looks further than the evaluator, which flies look-ahead after the candidates and ends with its
-        horizon. Faulted for less than the cap, the planner was overruled in 3 of 46 worlds of scenario `paper`, each
-        time while most sensors were unheard. One of these lost 96 packets instead of 22, one 0 instead of 7.
+        horizon. Faulted for less than the cap, the planner was wrongly overruled while most sensors were unheard.
         """
         least = lost.min()
         if PLANNER in self.advised:

@@ -125,6 +125,8 @@ class StoredMissions:
         """Take the lease of a mission that is in memory or in the store; returns whether it is."""
         if mission_id not in self._missions:
             await self._journal.stored(1.0)  # Of a deletion that is not committed yet the row is still there.
+            if self._journal.deleting(mission_id):
+                raise Unavailable("mission_id", f"mission {mission_id} is being deleted")
         if mission_id not in self._missions and not await self._read(self._store.has, mission_id):
             self.listed.discard(mission_id)
             await self._unless_misdirected(self.ownership.check_free, mission_id)

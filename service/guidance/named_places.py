@@ -30,18 +30,18 @@ def in_ids(
         pipeline: the line along which kilometres count, from its first point, metres.
     """
     given = [(name, (sensor,)) for sensor, name in enumerate(names.sensors if names else ()) if name]
-    lower, doubts = note.lower(), []
-    given += [(s.name, _sensors_of(s, places)) for s in shapes if s.name and s.name.lower() in lower]  # type: ignore[misc]
+    lower, doubts = _key(note), []
+    given += [(s.name, _sensors_of(s, places)) for s in shapes if s.name and _key(s.name) in lower]  # type: ignore[misc]
     meanings: dict[str, set[tuple[int, ...]]] = defaultdict(set)
     for name, sensors in given:
-        usable = (len(name) >= 3 or re.search(r"\d", name)) and not name.isdigit() and name.lower() not in _WORDS
+        usable = (len(name) >= 3 or re.search(r"\d", name)) and not name.isdigit() and _key(name) not in _WORDS
         if usable and 0 < len(sensors) <= _MOST_SENSORS:
-            meanings[name.lower()].add(sensors)
+            meanings[_key(name)].add(sensors)
 
     def read(found: re.Match[str]) -> str:
         if found["km"]:
             ids, doubt = _at_kilometre(float(found["km"].replace(",", ".")), places, pipeline)
-        elif len(meant := meanings[found["name"].lower()]) == 1:
+        elif len(meant := meanings[_key(found["name"])]) == 1:
             return _listed(*meant)
         else:
             every = _listed(sorted({sensor for sensors in meant for sensor in sensors}))
@@ -61,8 +61,13 @@ def in_ids(
     ]
     for begin in {found[0] for name in meanings if (found := re.match(r"[^\W\d]{2,}[ ._-]?(?=\d)", name))}:
         words = re.findall(rf"(?<!\w){re.escape(begin)}\d(?:[\w.-]*\w)?", text, re.IGNORECASE)
-        doubts += [f"“{word}” is no name of this mission." for word in words if word.lower() not in meanings]
+        doubts += [f"“{word}” is no name of this mission." for word in words if _key(word) not in meanings]
     return text, doubts
+
+
+def _key(text: str) -> str:
+    """In lower case; of the Turkish İ and ı an i, as the regular expressions here read them."""
+    return text.replace("İ", "i").replace("ı", "i").lower()
 
 
 def _listed(ids: Sequence[int]) -> str:

@@ -136,11 +136,11 @@ class NoteCompiler:
     def compile(self, mission: NoteOwner) -> None:
         """Begin to compile the mission's note, unless it has none or its note is compiled or being compiled."""
         key = id(mission.guidance)
-        if mission.guidance.status != "compiling" or key in self._tasks:
+        if mission.guidance.status != "compiling" or ((running := self._tasks.get(key)) and not running.done()):
             return
         task = asyncio.create_task(self._compile(mission), name="compile-note")
         self._tasks[key] = task
-        task.add_done_callback(lambda _: self._tasks.pop(key, None))
+        task.add_done_callback(lambda done: self._tasks.pop(key) if self._tasks.get(key) is done else None)
 
     async def close(self) -> None:
         """Cancel compiling."""

@@ -15,6 +15,7 @@ from service.errors import Conflict, Refused
 from shared.planning.guidance_messages import EndOfOrder, GuidanceAnswer, GuidanceState, GuidanceStatus, OrderRecord
 from shared.planning.orders import NO_GUIDANCE, End, Guidance, Impossible, once
 from shared.wire.names import Names, with_names
+from shared.wire.schemas import MAX_STEP
 from shared.world.scenario import Scenario
 
 # Most ended orders in memory.
@@ -144,7 +145,7 @@ class OperatorGuidance:
                 raise Impossible(f"ends.{name}.time", "this time has passed")
         kept = NO_GUIDANCE if replaces else self.confirmed.without(self._matching(withdrawn))
         # An order for some steps is counted from here on.
-        ends = {n: e if e.steps is None else End(step=step + e.steps) for n, e in guidance.ends.items()}
+        ends = {n: e if e.steps is None else End(step=min(step + e.steps, MAX_STEP)) for n, e in guidance.ends.items()}
         return Guidance.of(guidance.values, ends).added_to(kept, self._scenario.max_velocity + 1)
 
     def _matching(self, patterns: Sequence[str]) -> set[str]:

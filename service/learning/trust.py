@@ -51,9 +51,7 @@ LLM, PLANNER = "llm", "planner"
 # The initial weights. The planner looks further ahead than the other advisers, and its quality is known.
 PRIOR = {LLM: 0.2, PLANNER: 0.6, "value": 0.1, "policy": 0.1}
 # The initial weights without a planner. A bad LLM loses its weight within a few decisions, in which the evaluator
-# prevents its worst advice. An LLM that answers as the planner would lost 17.4 packets with a prior of 0.8, 19.1 with
-# 0.5, the planner itself 16.1; one that names the worst candidate 24.2 and 24.1 (20 worlds of scenario `paper`, seeds
-# from 1000 on).
+# prevents its worst advice.
 PRIOR_UNPLANNED = {LLM: 0.8, "value": 0.1, "policy": 0.1}
 
 

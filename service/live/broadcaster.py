@@ -174,7 +174,8 @@ class Broadcaster:
             stream.notify()
         ends = asyncio.get_running_loop().time() + _LAST_S
         for limit in self._sending:
-            limit.reschedule(min(limit.when() or ends, ends))
+            if not limit.expired():
+                limit.reschedule(min(limit.when() or ends, ends))
 
     @contextmanager
     def listener(self) -> Iterator[None]:

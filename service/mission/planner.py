@@ -42,7 +42,10 @@ class MissionPlanner(RecedingHorizon):
             reserved: sensors that are reserved in this step.
             seconds: wall clock for the search; the best plan until then counts.
         """
+        step = self.step
         async with self._lock:
+            if self.step != step or self._belief.decided(step).keys() >= {*uavs}:
+                return  # While this plan waited for others, its decisions were answered without it.
             horizon = self.copy()
 
             def search() -> list[tuple[Draft, Found]]:
@@ -60,5 +63,6 @@ class MissionPlanner(RecedingHorizon):
             except Exception:
                 log.exception("the planner failed; decisions go on without it")
                 return
-            for draft, best in found:
+            # The orders may have changed meanwhile.
+            for draft, best in found if horizon.guidance is self.guidance else ():
                 self.adopt(draft, best)

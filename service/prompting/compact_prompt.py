@@ -144,9 +144,7 @@ class CompactTemplate(GuidedTemplate):
     :mod:`service.deciding.attended_state`.
     """
 
-    # The adapter is trained on soft targets: 0.23 is the mean of its highest probability among some 20 candidates. In
-    # four development missions without the planner its advice loses 0.44, 0.33, 0.30, 0.29 and 0.29 packets a decision
-    # with the exponents 1, 2, 3, 5 and 10, the learned values 0.29 and the look-ahead 0.25 (the rollout evaluator's).
+    # The adapter is trained on soft targets: 0.23 is the mean of its highest probability among some 20 candidates.
     sharpness = 4.0
 
     def __init__(self, scenario: Scenario, *, rows: int) -> None:

@@ -17,7 +17,7 @@ from itertools import islice
 
 from service.observability.metrics import Metrics
 from service.storage.leases import LeaseLost
-from service.storage.operations import Change, Checkpoint, Entry, WriteFailed, Writer
+from service.storage.operations import Change, Checkpoint, Deleted, Entry, WriteFailed, Writer
 from service.storage.store import cause
 
 log = logging.getLogger(__name__)
@@ -102,6 +102,10 @@ class GroupCommit:
         self._queue.append((self._added, change))
         if self._state is _CommitState.IDLE:
             self._linger()
+
+    def deleting(self, mission_id: str) -> bool:
+        """Whether a deletion of the mission is not durable yet."""
+        return any(isinstance(change, Deleted) and change.mission_id == mission_id for _, change in self._queue)
 
     def supersede(self, checkpoint: Checkpoint) -> None:
         """Queue a checkpoint in place of the mission's queued events that it covers, at the last one's position.

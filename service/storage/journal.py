@@ -85,14 +85,15 @@ class Journal:
     """The journal of the missions of one store; used on the event loop only.
 
     Attributes:
-        stored: as :meth:`GroupCommit.stored`. Afterwards :meth:`lost` says whether the changes were dropped instead.
+        stored, deleting: as those of :class:`GroupCommit`. After ``stored``, :meth:`lost` says whether the changes
+            were dropped instead.
         on_lost: called with the ID of a mission that another edge has taken over.
         on_recovery: called when a checkpoint of every mission is due, because the database may have gone back.
     """
 
     def __init__(self, store: Store, metrics: Metrics) -> None:
         self._commits = GroupCommit(store.writer(), metrics, self._lose, self.recovered)
-        self.stored = self._commits.stored
+        self.stored, self.deleting = self._commits.stored, self._commits.deleting
         self.on_lost: Callable[[str], None] = lambda _: None
         self.on_recovery: Callable[[], None] = lambda: None
         self._loop = asyncio.get_running_loop()

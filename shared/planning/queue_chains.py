@@ -10,12 +10,10 @@ from shared.world.channel import FloatArray
 Floats = NDArray[np.float32]
 
 # A queue has at most this many levels in addition to the empty one, fewer than annealing_arrays.py has room for; with a
-# larger capacity a level is several packets. With 60 levels, one a packet, missions in six development worlds of
-# `shadowed` and `faulty` lost the same packets.
+# larger capacity a level is several packets.
 _MOST_LEVELS = 30
 # The levels are those of the queue's upper end: at least so many packets, and this factor times what arrives in the
-# steps that count, so many standard deviations above the mean. With levels of whole queues of 2,000 packets, a visit
-# that moves six packets counted as one of 67.
+# steps that count, so many standard deviations above the mean.
 _LEAST_TOP, _SPARE, _DEVIATIONS = 60, 1.5, 4.0
 # A negative binomial with this many successes is a Poisson distribution.
 _POISSON = 1e9

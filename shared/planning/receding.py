@@ -36,9 +36,7 @@ JOINT_UAVS, _NEIGHBOURS = 12, 12
 # Up to so many UAVs, and the most sensors of a plan: of these UAVs, of more, and of fleets that a plan does not cover.
 # There so many are in reach of those that need a decision. With more sensors the same search finds worse plans.
 _FEW_UAVS, _MOST_SENSORS, _OWN_SENSORS = 4, (40, 24, 30), 16
-# A plan that is expected to lose fewer packets is not improved: no search could save more. Of the plans in scenario
-# `paper` a third are such. With 0.05 two thirds are, but where arrivals come in bursts the expectation is too low, and
-# such plans lost many packets.
+# A plan that is expected to lose fewer packets is not improved: no search could save more.
 _NEGLIGIBLE = 0.003
 
 

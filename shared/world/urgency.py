@@ -15,7 +15,6 @@ from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario
 
 # The worth of a metre a second in urgent packets: while a UAV dwells at few packets, sensors further on overflow.
-# On 30 worlds of scenario `paper`, 0.5 to 4 lost 54 to 61 packets, differences within their noise.
 VELOCITY_BONUS = 0.5
 
 # The probability of no packet at this mean is still far from the smallest number.

@@ -16,6 +16,7 @@ from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 from starlette.testclient import TestClient
 
+from service.api.problem_details import problem_response
 from service.cluster.exchange import DECIDED_AT, Answer, Exchanged, OwnersGone
 from service.cluster.ingress import ingress_application
 from service.config.settings import Settings
@@ -161,6 +162,21 @@ def test_the_cluster_is_ready_when_all_edges_are() -> None:
     with ingress(Replies(OwnersGone(""), answers)) as client:
         answer = client.get("/readyz")
     assert answer.status_code == 503 and answer.json()["detail"] == "b"
+
+
+def test_a_cluster_whose_edges_do_not_say_whether_they_are_ready_is_not() -> None:
+    refused = {"a": problem_response(403, "an unknown host"), "b": problem_response(503, "the edge ends")}
+    answers = {n: Answer(r.status_code, list(r.raw_headers), bytes(r.body)) for n, r in refused.items()}
+    with ingress(Replies(OwnersGone(""), answers)) as client:
+        answer = client.get("/readyz")
+    assert answer.status_code == 503 and "no edge says" in answer.json()["detail"]
+
+
+def test_an_outcome_that_an_edge_has_applied_is_applied_whatever_another_says() -> None:
+    answers = {"a": Answer(503, [], b"{}"), "b": Answer(404, [], b"{}"), "c": Answer(200, [], b'{"result": "applied"}')}
+    with ingress(Replies(OwnersGone(""), answers)) as client:
+        answer = client.post("/feedback", json={"decision_id": "0" * 32, "cost": 0.0})
+    assert (answer.status_code, answer.json()) == (200, {"result": "applied"})
 
 
 def test_the_llm_of_the_cluster_is_ready_when_that_of_each_edge_is() -> None:

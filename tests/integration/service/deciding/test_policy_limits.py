@@ -30,6 +30,15 @@ def test_a_top_speed_limits_the_velocity_where_the_orders_allow_it(
         assert answer["velocity"] in flown
 
 
+def test_where_the_top_speed_is_forbidden_the_next_lower_velocity_is_flown(edge: Edge, report: Report) -> None:
+    client = edge(mode="policy", planner="off")
+    client.put("/missions/test", json={}).raise_for_status()
+    orders = {"guidance": {"forbidden_velocities": [8, 9], "min_velocity": 7}}
+    client.post("/missions/test/guidance", json=orders).raise_for_status()
+    [answer] = decide(client, "/decide", report(top_speed_mps=9.0))
+    assert answer["velocity"] == 7
+
+
 @pytest.mark.parametrize("path", PATHS)
 def test_where_every_reported_sensor_is_reserved_another_one_is_tried(edge: Edge, report: Report, path: str) -> None:
     client = edge(mode="policy", planner="off")

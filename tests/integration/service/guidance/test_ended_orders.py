@@ -31,6 +31,15 @@ OWN_IN_WORDS = [
 NOTED_IN_WORDS = "Visit sensor 3 at least once in every 3 steps."
 
 
+def test_an_order_for_more_steps_than_a_mission_can_have_ends_with_the_last(edge: Edge, report: Report) -> None:
+    client = edge(mode="value")
+    client.put("/missions/test", json={}).raise_for_status()
+    assert client.post("/decide", json=report(step=950_000)).status_code == 200
+    given = {"sensors": [{"sensor_id": 1, "visit_every": 3}], "ends": {"visit:1": {"steps": 100_000}}}
+    reported = client.post(AT, json={"guidance": given})
+    assert reported.status_code == 200 and "1000000" in reported.text
+
+
 def say(client: httpx.Client, **answer: Any) -> dict[str, Any]:
     response = client.post(AT, json=answer)
     assert response.status_code == 200, response.text

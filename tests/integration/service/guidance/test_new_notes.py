@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
+from types import SimpleNamespace
+from typing import cast
+
+from service.config.settings import Settings
+from service.guidance.note_compiler import NoteCompiler
+from service.llm.server_pool import ServerPool
+from service.mission.mission import Mission
+from shared.planning.guidance_messages import GuidanceAnswer
+from shared.wire.schemas import MissionSpec
 from tests.integration.service.guidance.test_operator_guidance import NOTE, ORDERS, OWN, Edge, Scribe, guidance
 from tests.support.running import serving
 from tests.support.stub_llm import wait_for
-from tests.support.waiting import Gate, until
+from tests.support.waiting import PATIENCE_S, Gate, until
 
 
 def test_a_new_note_is_compiled_while_the_orders_before_it_stay(edge: Edge) -> None:
@@ -74,3 +84,25 @@ def test_the_spaces_of_other_languages_are_spaces(edge: Edge) -> None:
     note = "Visit\u00a0sensor 3 every\u202f4\u3000steps."
     assert client.put("/missions/test", json={"note": note}).status_code == 200
     assert guidance(client, "proposed")["note"] == "Visit sensor 3 every 4 steps."
+
+
+def test_a_note_that_comes_just_as_the_one_before_it_is_compiled_is_compiled_too() -> None:
+    mission = Mission("test", MissionSpec(note="visit sensor 4 every 3 steps"), Settings(mode="policy"))
+
+    async def compiled() -> None:
+        def give(_: str) -> None:
+            # A request that is answered between the last step of the note's task and its callbacks.
+            compiler._on_change = lambda _: None
+            asyncio.get_running_loop().call_soon(post)
+
+        def post() -> None:
+            mission.answer_guidance(GuidanceAnswer(note="visit sensor 5 every 3 steps"))
+            compiler.compile(mission)
+
+        compiler = NoteCompiler(cast(ServerPool, SimpleNamespace(status="off", recovering=False)), give)
+        compiler.compile(mission)
+        async with asyncio.timeout(PATIENCE_S):
+            while mission.guidance.status != "proposed" or "5" not in (mission.guidance.note or ""):
+                await asyncio.sleep(0.01)
+
+    asyncio.run(compiled())

@@ -134,3 +134,19 @@ def test_a_mission_whose_deletion_is_under_way_does_not_come_back(postgres: str,
         gate.open()
         assert (deleted.result().status_code, asked.result().status_code) == (204, 404)
         assert client.get("/missions/test").status_code == 404
+
+
+def test_nor_does_it_while_the_deletion_takes_longer_than_a_request_waits(postgres: str, report: Report) -> None:
+    with Gate() as gate, running(postgres) as (client, engine), ThreadPoolExecutor(1) as pool:
+        fly(client, report, range(2))
+        commits: Any = engine.journal._commits  # type: ignore[union-attr]
+        commits._writer._jobs.put(gate.wait)
+        until(lambda: gate.callers)
+        deleted = pool.submit(client.delete, "/missions/test")
+        until(lambda: commits._queue)
+        asked = client.get("/missions/test")
+        assert asked.status_code == 503 and "is being deleted" in asked.json()["detail"]
+        gate.open()
+        until(lambda: not commits._queue)
+        assert deleted.result().status_code in (204, 503)
+        assert client.get("/missions/test").status_code == 404

@@ -33,6 +33,13 @@ def read_note() -> Read:
     return lambda note: in_ids(note, site.names, shapes, sites, site.scenario.pipeline)
 
 
+@pytest.mark.parametrize("name", ["Izmir-1", "İzmir-1", "ızmir-1"])
+@pytest.mark.parametrize("written", ["izmir-1", "İZMİR-1", "Izmır-1"])
+def test_a_name_with_turkish_letters_is_read(name: str, written: str) -> None:
+    read = in_ids(f"visit {written} every 3 steps", Names(sensors=[None, name]), (), np.zeros((2, 2)), ())
+    assert read == ("visit sensor 1 every 3 steps", [])
+
+
 @pytest.mark.parametrize(
     ("note", "read"),
     [
