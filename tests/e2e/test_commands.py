@@ -50,7 +50,7 @@ FLOWN = {
 # The edge that the others are flown against is this one; the commands of "Keys" have an edge of their own.
 SERVED = [
     f"{BIN}aicvds serve",
-    f"AICVDS_LLM_URL=http://localhost:11434/v1 AICVDS_LLM_MODEL=qwen3:8b {BIN}aicvds serve",
+    f"AICVDS_LLM_URL=http://localhost:11434/v1 AICVDS_LLM_MODEL=llama3.2:3b {BIN}aicvds serve",
     "AICVDS_LLM_URL=http://localhost:8081/v1,http://localhost:8082/v1 AICVDS_LLM_ORDER=mission AICVDS_LLM_SLOTS=4 "
     f"{BIN}aicvds serve",
     "AICVDS_LLM_URL=https://api.openai.com/v1 AICVDS_LLM_MODEL=gpt-4o-mini AICVDS_LLM_API_KEY=sk-… \\\n"
@@ -59,7 +59,7 @@ SERVED = [
 ]
 KEYED = [
     f"KEY=$({BIN}aicvds keys add fleet-1 --file keys.json --scopes decide admin)",
-    f"AICVDS_KEYS=keys.json {BIN}aicvds serve --host 0.0.0.0",
+    f"AICVDS_KEYS=keys.json {BIN}aicvds serve --host 0.0.0.0 &",
     f"AICVDS_API_KEY=$KEY {BIN}aicvds simulate --edge {EDGE} --out runs/mission",
 ]
 # Their command lines are parsed and no more; by how they begin.
