@@ -212,7 +212,7 @@ def test_an_edge_with_keys_is_flown_as_shown(workspace: Path) -> None:
     url = f"http://localhost:{port}"
     # `exec` takes no assignments before it.
     settings, _, rest = serve.partition(" ")
-    with in_the_background(f"env {settings} AICVDS_MODE=policy {rest} --port {port}", workspace):
+    with in_the_background(f"env {settings} AICVDS_MODE=policy {rest.removesuffix(' &')} --port {port}", workspace):
         with EdgeClient(url) as waiting:
             waiting.wait_ready(PATIENCE_S)
         assert httpx.get(f"{url}/missions/none", timeout=PATIENCE_S).status_code == 401
