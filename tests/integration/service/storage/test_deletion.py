@@ -6,11 +6,13 @@ import asyncio
 import gc
 import os
 import weakref
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from service.edge.mission_registry import MissionRegistry
@@ -120,7 +122,11 @@ def test_a_mission_deleted_while_it_wakes_stays_deleted(
         assert client.get("/missions/test").json()["decisions"] == 1
 
 
-def test_a_mission_whose_deletion_is_under_way_does_not_come_back(postgres: str, report: Report) -> None:
+@contextmanager
+def deletion_under_way(
+    postgres: str, report: Report
+) -> Iterator[tuple[httpx.Client, ThreadPoolExecutor, Gate, Callable[[], bool], Future[httpx.Response]]]:
+    """A client, a pool, the gate that the deletion's commit waits for, whether it waits still, and its answer."""
     with Gate() as gate, running(postgres) as (client, engine), ThreadPoolExecutor(2) as pool:
         fly(client, report, range(2))
         commits: Any = engine.journal._commits  # type: ignore[union-attr]
@@ -128,6 +134,11 @@ def test_a_mission_whose_deletion_is_under_way_does_not_come_back(postgres: str,
         until(lambda: gate.callers)
         deleted = pool.submit(client.delete, "/missions/test")
         until(lambda: commits._queue)
+        yield client, pool, gate, lambda: bool(commits._queue), deleted
+
+
+def test_a_mission_whose_deletion_is_under_way_does_not_come_back(postgres: str, report: Report) -> None:
+    with deletion_under_way(postgres, report) as (client, pool, gate, _, deleted):
         asked = pool.submit(client.get, "/missions/test")
         with pytest.raises(TimeoutError):
             asked.result(0.2)
@@ -137,16 +148,10 @@ def test_a_mission_whose_deletion_is_under_way_does_not_come_back(postgres: str,
 
 
 def test_nor_does_it_while_the_deletion_takes_longer_than_a_request_waits(postgres: str, report: Report) -> None:
-    with Gate() as gate, running(postgres) as (client, engine), ThreadPoolExecutor(1) as pool:
-        fly(client, report, range(2))
-        commits: Any = engine.journal._commits  # type: ignore[union-attr]
-        commits._writer._jobs.put(gate.wait)
-        until(lambda: gate.callers)
-        deleted = pool.submit(client.delete, "/missions/test")
-        until(lambda: commits._queue)
+    with deletion_under_way(postgres, report) as (client, _, gate, waits, deleted):
         asked = client.get("/missions/test")
         assert asked.status_code == 503 and "is being deleted" in asked.json()["detail"]
         gate.open()
-        until(lambda: not commits._queue)
+        until(lambda: not waits())
         assert deleted.result().status_code in (204, 503)
         assert client.get("/missions/test").status_code == 404
