@@ -80,8 +80,8 @@ class Pipeline:
             velocity = orders.nearest(choice.action.velocity, task.mission.scenario.max_velocity + 1)
             choice = replace(choice, action=Action(choice.action.sensor_id, velocity))
         fastest = task.mission.belief.drift.fastest([task.uav.uav_id], choice.action.velocity)
-        slower = [v for v in range(fastest + 1) if task.mission.guidance.confirmed.allows(v)]
-        if fastest < choice.action.velocity and slower:
+        allows = task.mission.guidance.confirmed.allows
+        if fastest < choice.action.velocity and (slower := [v for v in range(fastest + 1) if allows(v)]):
             choice = replace(choice, action=Action(choice.action.sensor_id, slower[-1]))
         pending = state.pending(decision_id, choice.action)
         task.watch.ended.append(("check", perf_counter()))
